@@ -1,0 +1,1 @@
+"""Presets as YAML: only differences from the defaults in `stages.settings`."""

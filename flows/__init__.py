@@ -1,0 +1,1 @@
+"""Orchestration: the only floor that knows Prefect and the command line."""

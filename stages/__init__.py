@@ -1,0 +1,1 @@
+"""Idempotent steps of the pipeline: artifacts in, artifact out."""

@@ -1,0 +1,271 @@
+"""What passes between stages: frozen values that save to and load from a folder.
+
+All tensors are float32 on the CPU, channel last. Nothing is pickled.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Self
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from svim3d.cameras import Cameras
+from svim3d.fields.material_field import MaterialFieldSpec
+from svim3d.io.exr import read_rgb, write_rgb
+from svim3d.io.image import read_png, write_png
+from svim3d.io.orbit import read_orbit, write_orbit
+from svim3d.io.weights import load_tensors, save_tensors
+from svim3d.shading.environment import latlong_from_octahedral
+
+
+@dataclass(frozen=True)
+class MaterialViews:
+    """V views of one object with materials: what the generator makes.
+
+    Attributes:
+        cameras: V poses; all views share field of view and size.
+        radiance: scene-linear, premultiplied by `mask`.
+        mask: coverage in [0, 1].
+        basecolor: linear, straight (not premultiplied); zero where the mask is.
+        roughness: perceptual, straight.
+        metallic: straight.
+        normal_world: unit shading normals, straight.
+        reference: index of the view at azimuth 0 that the asset was asked for by.
+    """
+
+    cameras: Cameras
+    radiance: Float[Tensor, "V H W 3"]
+    mask: Float[Tensor, "V H W 1"]
+    basecolor: Float[Tensor, "V H W 3"]
+    roughness: Float[Tensor, "V H W 1"]
+    metallic: Float[Tensor, "V H W 1"]
+    normal_world: Float[Tensor, "V H W 3"]
+    reference: int
+
+    def save(self, folder: Path) -> None:
+        """Write an orbit folder (the exchange format, see README)."""
+        write_orbit(
+            folder,
+            self.cameras,
+            {
+                "radiance": self.radiance,
+                "mask": self.mask,
+                "basecolor": self.basecolor,
+                "roughness": self.roughness,
+                "metallic": self.metallic,
+                "normal_world": self.normal_world,
+            },
+            reference=self.reference,
+        )
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        """Read an orbit folder."""
+        cameras, images, reference = read_orbit(folder)
+        return cls(cameras=cameras, reference=reference, **images)
+
+
+@dataclass(frozen=True)
+class EnvironmentLight:
+    """Radiance from all directions.
+
+    Attributes:
+        radiance: octahedral map, linear, non-negative; see `svim3d.shading.octahedral`.
+    """
+
+    radiance: Float[Tensor, "N N 3"]
+
+    def save(self, folder: Path) -> None:
+        """Write the octahedral map in full precision and a lat-long picture of it."""
+        write_rgb(folder / "environment_octahedral.exr", self.radiance.numpy(), half=False)
+        height = max(16, self.radiance.shape[0])
+        latlong = latlong_from_octahedral(self.radiance, height=height)
+        write_rgb(folder / "environment.exr", latlong.numpy(), half=True)
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        """Read the octahedral map."""
+        return cls(torch.from_numpy(read_rgb(folder / "environment_octahedral.exr")))
+
+
+@dataclass(frozen=True)
+class FittedField:
+    """Phase 1's result: where the surface is, what it is made of, what lights it.
+
+    Attributes:
+        sdf: signed distance at the nodes of a cubic grid over [-half_extent, half_extent]^3, index
+            order x, y, z; positive inside. A density field is stored as the grid of
+            (density - threshold), scaled to about unit gradient at the surface.
+        half_extent: half the side of the cube, world units.
+        material_spec: shape of the material field.
+        material_state: its parameters (`MaterialField.state_dict()`).
+        environment: octahedral radiance as optimised with the field.
+    """
+
+    sdf: Float[Tensor, "n n n"]
+    half_extent: float
+    material_spec: MaterialFieldSpec
+    material_state: dict[str, Tensor]
+    environment: Float[Tensor, "N N 3"]
+
+    def save(self, folder: Path) -> None:
+        """Write one safetensors file and a readable spec."""
+        tensors = {"sdf": self.sdf, "environment": self.environment}
+        tensors |= {f"material.{name}": value for name, value in self.material_state.items()}
+        save_tensors(folder / "field.safetensors", tensors)
+        spec = {"half_extent": self.half_extent, "materials": asdict(self.material_spec)}
+        (folder / "field.json").write_text(json.dumps(spec, indent=1))
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        """Read both files."""
+        tensors = load_tensors(folder / "field.safetensors")
+        spec = json.loads((folder / "field.json").read_text())
+        return cls(
+            sdf=tensors.pop("sdf"),
+            environment=tensors.pop("environment"),
+            half_extent=spec["half_extent"],
+            material_spec=MaterialFieldSpec(**spec["materials"]),
+            material_state={name.removeprefix("material."): t for name, t in tensors.items()},
+        )
+
+
+@dataclass(frozen=True)
+class RefinedSurface:
+    """Phase 2's result: an explicit surface with its own material field and light.
+
+    Attributes:
+        vertices: world positions.
+        faces: counter-clockwise seen from outside; closed and manifold.
+        material_spec: shape of the material field.
+        material_state: its parameters, refined from phase 1.
+        environment: octahedral radiance.
+    """
+
+    vertices: Float[Tensor, "N 3"]
+    faces: Int[Tensor, "F 3"]
+    material_spec: MaterialFieldSpec
+    material_state: dict[str, Tensor]
+    environment: Float[Tensor, "M M 3"]
+
+    def save(self, folder: Path) -> None:
+        """Write one safetensors file and a readable spec."""
+        tensors = {
+            "vertices": self.vertices,
+            "faces": self.faces,
+            "environment": self.environment,
+        }
+        tensors |= {f"material.{name}": value for name, value in self.material_state.items()}
+        save_tensors(folder / "surface.safetensors", tensors)
+        spec = {"materials": asdict(self.material_spec)}
+        (folder / "surface.json").write_text(json.dumps(spec, indent=1))
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        """Read both files."""
+        tensors = load_tensors(folder / "surface.safetensors")
+        spec = json.loads((folder / "surface.json").read_text())
+        return cls(
+            vertices=tensors.pop("vertices"),
+            faces=tensors.pop("faces"),
+            environment=tensors.pop("environment"),
+            material_spec=MaterialFieldSpec(**spec["materials"]),
+            material_state={name.removeprefix("material."): t for name, t in tensors.items()},
+        )
+
+
+@dataclass(frozen=True)
+class TexturedMesh:
+    """A mesh ready for export, textured (phase 3) or coloured per vertex (phase 3 skipped).
+
+    A vertex appears once per texture coordinate, as in glTF. Textures have row 0 at the top and
+    `uv` has its origin at the top left, as in glTF.
+
+    Attributes:
+        vertices: world positions.
+        faces: counter-clockwise seen from outside.
+        normals: unit, per vertex.
+        uv: texture coordinates in [0, 1], or None when coloured per vertex.
+        tangents: unit tangent and handedness (+1 or -1), MikkTSpace-compatible, or None.
+        basecolor: linear, in [0, 1]: a texture [T, T, 3] or per vertex [N, 3].
+        orm: occlusion, roughness, metallic in [0, 1], same layout.
+        normal_tangent: texture of unit tangent-space normals, green up, or None.
+    """
+
+    vertices: Float[Tensor, "N 3"]
+    faces: Int[Tensor, "F 3"]
+    normals: Float[Tensor, "N 3"]
+    uv: Float[Tensor, "N 2"] | None
+    tangents: Float[Tensor, "N 4"] | None
+    basecolor: Float[Tensor, "*texels 3"]
+    orm: Float[Tensor, "*texels 3"]
+    normal_tangent: Float[Tensor, "T T 3"] | None
+
+    def save(self, folder: Path) -> None:
+        """Write geometry as safetensors and textures as PNG (basecolor sRGB, 8 bit)."""
+        geometry = {"vertices": self.vertices, "faces": self.faces, "normals": self.normals}
+        if self.uv is not None and self.tangents is not None and self.normal_tangent is not None:
+            geometry |= {"uv": self.uv, "tangents": self.tangents}
+            write_png(folder / "basecolor.png", self.basecolor, srgb=True)
+            write_png(folder / "orm.png", self.orm)
+            write_png(folder / "normal.png", self.normal_tangent * 0.5 + 0.5)
+        else:
+            geometry |= {"basecolor": self.basecolor, "orm": self.orm}
+        save_tensors(folder / "mesh.safetensors", geometry)
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        """Read geometry and, where there are any, textures."""
+        geometry = load_tensors(folder / "mesh.safetensors")
+        textured = "uv" in geometry
+        return cls(
+            vertices=geometry["vertices"],
+            faces=geometry["faces"],
+            normals=geometry["normals"],
+            uv=geometry.get("uv"),
+            tangents=geometry.get("tangents"),
+            basecolor=(
+                read_png(folder / "basecolor.png", srgb=True)
+                if textured
+                else geometry["basecolor"]
+            ),
+            orm=read_png(folder / "orm.png") if textured else geometry["orm"],
+            normal_tangent=read_png(folder / "normal.png") * 2.0 - 1.0 if textured else None,
+        )
+
+
+@dataclass(frozen=True)
+class ExportedAsset:
+    """The finished files: always `asset.glb`, other formats on request.
+
+    Attributes:
+        files: relative name -> content.
+        summary: counts and checks made on the reopened file, for the run's table.
+    """
+
+    files: dict[str, bytes]
+    summary: dict[str, float | int | str | bool]
+
+    def save(self, folder: Path) -> None:
+        """Write every file and the summary."""
+        for name, content in self.files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(content)
+        (folder / "summary.json").write_text(json.dumps(self.summary, indent=1))
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        """Read them back."""
+        kept = {"summary.json", "manifest.json"}
+        return cls(
+            files={
+                str(f.relative_to(folder)): f.read_bytes()
+                for f in sorted(folder.rglob("*"))
+                if f.is_file() and f.name not in kept
+            },
+            summary=json.loads((folder / "summary.json").read_text()),
+        )
+

@@ -1,0 +1,194 @@
+"""What a stage is and what it is given to work with."""
+
+import csv
+import hashlib
+import inspect
+import logging
+import math
+import os
+import time
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import torch
+from torch import Tensor
+
+from stages.errors import DivergenceError
+from svim3d.io.weights import load_tensors, save_tensors
+
+log = logging.getLogger(__name__)
+
+CHECKPOINT_EVERY_S = 20.0  # a killed stage loses at most this much work
+MAX_NON_FINITE_STEPS = 20  # beyond this the optimisation is diverging, not hiccuping
+
+
+class Artifact(Protocol):
+    """A frozen value that passes between stages and lives in a folder."""
+
+    def save(self, folder: Path) -> None:
+        """Write the payload into an existing, empty folder."""
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        """Read the payload back, on the CPU."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One sign of life from a running stage."""
+
+    stage: str
+    step: int
+    total: int
+    terms: Mapping[str, float]
+
+
+class Checkpoints:
+    """Named tensors of a half-done stage: the last good step, replaced atomically."""
+
+    def __init__(self, folder: Path, every_s: float = CHECKPOINT_EVERY_S) -> None:
+        self._file = folder / "checkpoint.safetensors"
+        self._every_s = every_s
+        self._last_s = time.monotonic()
+
+    def due(self) -> bool:
+        """Whether enough time has passed since the last one."""
+        return time.monotonic() - self._last_s >= self._every_s
+
+    def save(self, step: int, tensors: Mapping[str, Tensor]) -> None:
+        """Replace the checkpoint by the state before `step`."""
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        temporary = self._file.with_suffix(".tmp")
+        save_tensors(temporary, {**tensors, "__step__": torch.tensor(step)})
+        os.replace(temporary, self._file)
+        self._last_s = time.monotonic()
+
+    def load(self) -> tuple[int, dict[str, Tensor]] | None:
+        """The step to go on with and its state, or None at the beginning."""
+        if not self._file.exists():
+            return None
+        tensors = load_tensors(self._file)
+        return int(tensors.pop("__step__")), tensors
+
+
+@dataclass
+class Context:
+    """What a stage may know of its surroundings.
+
+    Attributes:
+        stage: the stage's name.
+        device: where tensors should live.
+        seed: seed of the run; every generator derives from it.
+        work: private folder for checkpoints and scalars, kept until the artifact is published.
+        shared: folder for derived data that runs may share (content-addressed by its users).
+        on_progress: called at most a few times a second.
+        events: fallbacks taken, views dropped, steps skipped; they end up in the manifest.
+    """
+
+    stage: str
+    device: torch.device
+    seed: int
+    work: Path
+    shared: Path
+    on_progress: Callable[[Progress], None] | None = None
+    events: list[dict[str, str]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.work.mkdir(parents=True, exist_ok=True)
+        self.checkpoints = Checkpoints(self.work)
+        self._scalars: typing.TextIO | None = None
+        self._last_progress_s = -math.inf
+        self._non_finite = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._scalars is not None:
+            self._scalars.close()
+
+    def generator(self, name: str, device: str | torch.device = "cpu") -> torch.Generator:
+        """A random generator that depends on the run's seed, the stage and `name` alone."""
+        digest = hashlib.sha256(f"{self.seed}/{self.stage}/{name}".encode()).digest()
+        return torch.Generator(device=device).manual_seed(int.from_bytes(digest[:7], "big"))
+
+    def event(self, kind: str, message: str) -> None:
+        """Record something the operator should know and the manifest must keep."""
+        log.warning("%s: %s", self.stage, message)
+        self.events.append({"kind": kind, "message": message})
+
+    def report(self, step: int, total: int, terms: Mapping[str, float]) -> None:
+        """Append scalars to `scalars.csv` and show progress; cheap enough for every step."""
+        if self._scalars is None:
+            self._scalars = (self.work / "scalars.csv").open("a", newline="")
+        writer = csv.writer(self._scalars)
+        writer.writerows([step, name, f"{value:.6g}"] for name, value in terms.items())
+        now = time.monotonic()
+        if self.on_progress is not None and (now - self._last_progress_s > 0.2 or step == total):
+            self._last_progress_s = now
+            self.on_progress(Progress(self.stage, step, total, dict(terms)))
+
+    def is_finite(self, step: int, terms: Mapping[str, Tensor]) -> bool:
+        """Whether all loss terms are finite; a bad step is counted and should be skipped.
+
+        Raises:
+            DivergenceError: after `MAX_NON_FINITE_STEPS` bad steps.
+        """
+        bad = [name for name, value in terms.items() if not bool(torch.isfinite(value).all())]
+        if not bad:
+            return True
+        self._non_finite += 1
+        self.event("non_finite_step", f"step {step} skipped: non-finite {', '.join(bad)}")
+        if self._non_finite > MAX_NON_FINITE_STEPS:
+            raise DivergenceError(
+                f"{self.stage}: more than {MAX_NON_FINITE_STEPS} steps had a non-finite "
+                f"{', '.join(bad)}; lower the learning rate or check the input for NaN"
+            )
+        return False
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage's `run` function, with what its signature says about inputs and output.
+
+    `run(<artifact or None>..., *, config, ctx) -> Artifact`. An input annotated `Path` is a file or
+    folder from outside; any other is an artifact class, `| None` where the input may be skipped.
+    """
+
+    run: Callable[..., Any]
+
+    def _hints(self) -> dict[str, Any]:
+        return typing.get_type_hints(self.run)
+
+    @property
+    def inputs(self) -> dict[str, type]:
+        """Input names with the class that each is loaded as."""
+        hints = self._hints()
+        positional = [
+            p.name
+            for p in inspect.signature(self.run).parameters.values()
+            if p.kind is not inspect.Parameter.KEYWORD_ONLY
+        ]
+        return {name: _without_none(hints[name]) for name in positional}
+
+    @property
+    def output(self) -> type[Any]:
+        """The artifact class that `run` returns."""
+        output: type[Any] = self._hints()["return"]
+        return output
+
+
+def _without_none(annotation: Any) -> type:
+    """`A | None` -> `A`."""
+    options = [a for a in typing.get_args(annotation) if a is not type(None)]
+    chosen: type = options[0] if options else annotation
+    return chosen

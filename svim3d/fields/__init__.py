@@ -1,0 +1,1 @@
+"""Functions of position: hash-grid encodings, small networks, signed-distance grids, materials."""

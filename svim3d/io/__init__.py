@@ -1,0 +1,1 @@
+"""Doors to the file system, one per library; imported by stages and flows only."""

@@ -1,0 +1,1 @@
+"""Where field, mesh, light and camera meet."""

@@ -1,0 +1,1 @@
+"""Light and reflectance: microfacet model, environment maps, split-sum shading, tone mapping."""
