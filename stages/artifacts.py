@@ -10,6 +10,7 @@ from typing import Self
 
 import torch
 from jaxtyping import Float, Int
+from svim3d.shading.environment import latlong_from_octahedral
 from torch import Tensor
 
 from svim3d.cameras import Cameras
@@ -18,7 +19,6 @@ from svim3d.io.exr import read_rgb, write_rgb
 from svim3d.io.image import read_png, write_png
 from svim3d.io.orbit import read_orbit, write_orbit
 from svim3d.io.weights import load_tensors, save_tensors
-from svim3d.shading.environment import latlong_from_octahedral
 
 
 @dataclass(frozen=True)
@@ -228,9 +228,7 @@ class TexturedMesh:
             uv=geometry.get("uv"),
             tangents=geometry.get("tangents"),
             basecolor=(
-                read_png(folder / "basecolor.png", srgb=True)
-                if textured
-                else geometry["basecolor"]
+                read_png(folder / "basecolor.png", srgb=True) if textured else geometry["basecolor"]
             ),
             orm=read_png(folder / "orm.png") if textured else geometry["orm"],
             normal_tangent=read_png(folder / "normal.png") * 2.0 - 1.0 if textured else None,
@@ -268,4 +266,3 @@ class ExportedAsset:
             },
             summary=json.loads((folder / "summary.json").read_text()),
         )
-
