@@ -24,8 +24,8 @@ class TetrahedralLattice:
         tetrahedra: four nodes each, positively oriented.
         edges: two nodes each, the lower index first; every edge once.
         tetrahedron_edges: the edges of each tetrahedron in the order of `EDGE_ENDS`.
-        source: where each node's value stands in the concatenated flat arrays of corners, centres.
-        fixed: nodes at the border of the lattice. While they keep their sign, the surface is closed.
+        source: place of each node's value in the flat arrays of corners and centres, joined.
+        fixed: nodes at the lattice's border. While they keep their sign, the surface is closed.
         spacing: side of a cell.
     """
 
