@@ -33,7 +33,7 @@ def interpolate(
     size = tuple(fragments.triangle.shape)
     triangle = fragments.triangle.reshape(-1)[pixels]
     if clip.device.type == "cpu":
-        values: Tensor = _Interpolation.apply(
+        values: Tensor = _Interpolation.apply(  # type: ignore[no-untyped-call]
             clip, attributes, faces.int().contiguous(), triangle, pixels, size
         )
         return pixels, values
@@ -173,21 +173,32 @@ class _Interpolation(torch.autograd.Function):
         ctx.save_for_backward(clip, attributes, faces, triangle, pixels)
         ctx.size = size
         values = attributes.new_empty(len(pixels), attributes.shape[1])
-        inputs = [t.numpy() for t in (clip, attributes, faces, triangle, pixels)]
         _interpolate_forward(
-            *inputs, size, values.numpy(), BLOCKS_PER_THREAD * numba.get_num_threads()
+            clip.numpy(),
+            attributes.numpy(),
+            faces.numpy(),
+            triangle.numpy(),
+            pixels.numpy(),
+            size,
+            values.numpy(),
+            BLOCKS_PER_THREAD * numba.get_num_threads(),
         )
         return values
 
     @staticmethod
-    def backward(ctx: Any, grad_values: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, grad_values: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients of clip positions and attributes."""
-        clip, attributes = ctx.saved_tensors[:2]
-        grads = torch.zeros_like(clip), torch.zeros_like(attributes)
+        clip, attributes, faces, triangle, pixels = ctx.saved_tensors
+        grad_clip, grad_attributes = torch.zeros_like(clip), torch.zeros_like(attributes)
         _interpolate_backward(
-            *(t.numpy() for t in ctx.saved_tensors),
+            clip.numpy(),
+            attributes.numpy(),
+            faces.numpy(),
+            triangle.numpy(),
+            pixels.numpy(),
             ctx.size,
             grad_values.contiguous().numpy(),
-            *(g.numpy() for g in grads),
+            grad_clip.numpy(),
+            grad_attributes.numpy(),
         )
-        return *grads, None, None, None, None
+        return grad_clip, grad_attributes, None, None, None, None

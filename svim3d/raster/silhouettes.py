@@ -1,10 +1,10 @@
 """Silhouettes that move: coverage as a differentiable function of vertex positions.
 
-Where two neighbouring pixel centres see different surfaces, an edge of the nearer one passes between
-them. The edge is found by walking over front-facing triangles from the near centre towards the far
-one until the surface turns away; the colours of the pair are then blended by where the edge crosses
-the segment. Unlike a test of the pixel's own triangle, the walk finds the edge also when triangles
-are smaller than pixels.
+Where two neighbouring pixel centres see different surfaces, an edge of the nearer one passes
+between them. The edge is found by walking over front-facing triangles from the near centre towards
+the far one until the surface turns away; the colours of the pair are then blended by where the edge
+crosses the segment. Unlike a test of the pixel's own triangle, the walk finds the edge also when
+triangles are smaller than pixels.
 """
 
 from dataclasses import dataclass

@@ -243,7 +243,8 @@ def rasterize_scatter(
     empty = torch.iinfo(torch.int64).max
     packed = torch.full((height * width,), empty, dtype=torch.int64, device=clip.device)
     chunk = torch.cumsum(count[kept], 0) // CANDIDATES_PER_CHUNK
-    for part in kept.split(torch.unique_consecutive(chunk, return_counts=True)[1].tolist()):
+    sizes = torch.unique_consecutive(chunk, return_counts=True)[1].tolist()
+    for part in torch.split(kept, sizes):
         pixel, key = _cover(
             planes[part], part, box[part], columns[part], count[part], (height, width)
         )
