@@ -5,7 +5,6 @@ import hashlib
 import inspect
 import logging
 import math
-import os
 import time
 import typing
 from collections.abc import Callable, Mapping
@@ -64,7 +63,7 @@ class Checkpoints:
         self._file.parent.mkdir(parents=True, exist_ok=True)
         temporary = self._file.with_suffix(".tmp")
         save_tensors(temporary, {**tensors, "__step__": torch.tensor(step)})
-        os.replace(temporary, self._file)
+        temporary.replace(self._file)
         self._last_s = time.monotonic()
 
     def load(self) -> tuple[int, dict[str, Tensor]] | None:
