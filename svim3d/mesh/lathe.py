@@ -66,7 +66,9 @@ def revolve(profile: Float[Tensor, "K 2"], *, rounds: int, segments: int) -> Bod
     # Counter-clockwise seen from above, from +z towards +x.
     around = torch.stack([angle.sin(), torch.zeros_like(angle), angle.cos()], 1)
     up = torch.tensor([0.0, 1.0, 0.0])
-    tangent = _tangents(curve)
+    # Beyond the axis the profile goes on as its mirror image, so that the poles are smooth.
+    mirror = curve.new_tensor([-1.0, 1.0])
+    tangent = _tangents(torch.cat([curve[1:2] * mirror, curve, curve[-2:-1] * mirror]))
     outward = normalize(torch.stack([tangent[:, 1], -tangent[:, 0]], 1))
     vertices = curve[:, :1, None] * around + curve[:, 1:, None] * up
     normals = outward[:, :1, None] * around + outward[:, 1:, None] * up
@@ -82,7 +84,7 @@ def sweep(path: Float[Tensor, "K 4"], *, rounds: int, segments: int) -> Body:
         segments: facets around.
     """
     curve, parameter = smooth_curve(path, rounds)
-    tangent = normalize(_tangents(curve[:, :3]))
+    tangent = normalize(_tangents(torch.cat([curve[:1], curve, curve[-1:]])[:, :3]))
     side = _parallel_frames(tangent)
     across = torch.linalg.cross(tangent, side)
     angle = torch.linspace(0.0, 2.0 * math.pi, segments + 1)
@@ -97,10 +99,9 @@ def sweep(path: Float[Tensor, "K 4"], *, rounds: int, segments: int) -> Body:
     return _grid_body(vertices, normals, v)
 
 
-def _tangents(curve: Float[Tensor, "M D"]) -> Float[Tensor, "M D"]:
-    """Central differences, one-sided at the ends."""
-    padded = torch.cat([curve[:1], curve, curve[-1:]])
-    return padded[2:] - padded[:-2]
+def _tangents(extended: Float[Tensor, "M+2 D"]) -> Float[Tensor, "M D"]:
+    """Central differences of a curve that is given with one more point at either end."""
+    return extended[2:] - extended[:-2]
 
 
 def _parallel_frames(tangent: Float[Tensor, "M 3"]) -> Float[Tensor, "M 3"]:
@@ -116,7 +117,7 @@ def _parallel_frames(tangent: Float[Tensor, "M 3"]) -> Float[Tensor, "M 3"]:
 def _grid_body(
     vertices: Float[Tensor, "M S 3"], normals: Float[Tensor, "M S 3"], v: Float[Tensor, "M"]
 ) -> Body:
-    """Triangulate a grid of M rings; triangles without area (poles) are left out."""
+    """Triangulate a grid of M rings; triangles with two equal corners are left out."""
     rows, columns = vertices.shape[:2]
     u = torch.linspace(0.0, 1.0, columns)
     uv = torch.stack([u.expand(rows, columns), v[:, None].expand(rows, columns)], -1)
@@ -126,6 +127,6 @@ def _grid_body(
     faces = torch.stack([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)], 1).view(-1, 3)
     flat = vertices.reshape(-1, 3)
     corners = flat[faces]
-    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    faces = faces[torch.linalg.vector_norm(area, dim=1) > 0.0]
+    collapsed = (corners == corners.roll(1, 1)).all(2).any(1)
+    faces = faces[~collapsed]
     return Body(flat, faces.int(), normals.reshape(-1, 3), uv.reshape(-1, 2))

@@ -1,31 +1,30 @@
-"""Pictures of a textured mesh: materials, normals and radiance of every view, supersampled.
+"""Supersampled pictures of meshes that carry their own materials, as others are measured against.
 
-These are the renders that others are measured against: every sample inside a pixel is textured and
-shaded on its own, then averaged. Light is an environment without visibility or interreflection, so
-that cavities are as bright as open surfaces.
+Every sample inside a pixel is textured and shaded on its own, then averaged. Light is an
+environment without visibility or interreflection, so that cavities are as bright as open surfaces.
 """
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from svim3d.cameras import Cameras
-from svim3d.mesh.frames import bitangents, world_from_tangent
-from svim3d.mesh.mesh import face_normals_scaled
+from svim3d.fields.material_field import Materials
 from svim3d.mesh.source_mesh import SourceMaterial, SourceMesh
-from svim3d.numerics import dot, normalize
-from svim3d.raster.interpolation import interpolate
 from svim3d.raster.texture import sample_texture
-from svim3d.raster.zbuffer import rasterize
+from svim3d.render.deferred import (
+    Geometry,
+    Shader,
+    SurfacePoints,
+    normal_from_tangent,
+    render_mesh,
+)
+from svim3d.shading.prefilter import EnvironmentPyramid
+from svim3d.shading.split_sum import shade
 
-MIN_COVERAGE = 1e-6  # keeps the mean over the covered samples finite where there are none
-
-# (normal, wo, basecolor, roughness, metallic) -> radiance, all [P, C]
-Shader = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
-ATTRIBUTES = {"position": 3, "normal": 3, "tangent": 3, "bitangent": 3, "color": 3, "uv": 2}
-AOVS = {"basecolor": 3, "roughness": 1, "metallic": 1, "normal_world": 3}
+ATTRIBUTES = {"uv": 2, "tangent": 4, "color": 3}
 
 
 def render_pictures(
@@ -36,99 +35,85 @@ def render_pictures(
     Args:
         mesh: in world space.
         cameras: V poses.
-        shader: gives the radiance that leaves a point towards the viewer.
+        shader: radiance from shading normal, direction to the viewer and materials.
         supersample: samples per pixel and axis.
 
     Returns:
         `radiance` (linear, premultiplied), `mask`, and straight `basecolor`, `roughness`,
-        `metallic`, `normal_world`: the six images of `MaterialViews`.
+        `metallic`, `normal_world`: the six images of an orbit.
     """
-    views = [_render_view(mesh, cameras, v, shader, supersample) for v in range(len(cameras))]
-    return {name: torch.stack([view[name] for view in views]) for name in views[0]}
+    geometry = Geometry(
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+        normals=mesh.normals,
+        attributes=torch.cat([mesh.uv, mesh.tangents, mesh.colors], 1),
+        two_sided=True,
+    )
+    materials = _MeshMaterials(mesh.face_material.long(), mesh.materials)
+    views = [
+        render_mesh(
+            geometry, materials, cameras, view=view, shader=shader, supersample=supersample
+        ).straight()
+        for view in range(len(cameras))
+    ]
+    names = ("radiance", "mask", "basecolor", "roughness", "metallic", "normal_world")
+    return {name: torch.stack([getattr(view, name) for view in views]) for name in names}
 
 
-def _render_view(
-    mesh: SourceMesh, cameras: Cameras, view: int, shader: Shader, supersample: int
-) -> dict[str, Float[Tensor, "H W C"]]:
-    """One view: sample, shade, average."""
-    fine = cameras[view].resized(cameras.height * supersample, cameras.width * supersample)
-    pixels, samples = surface_samples(mesh, fine)
-    wo = normalize(fine.positions[0] - samples["position"])
-    radiance = shader(samples["normal_world"], wo, *(samples[k] for k in list(AOVS)[:3]))
-    values = torch.cat([torch.ones_like(wo[:, :1]), radiance, *(samples[k] for k in AOVS)], 1)
-    image = values.new_zeros(fine.height * fine.width, values.shape[1])
-    image[pixels] = values
-    image = image.view(cameras.height, supersample, cameras.width, supersample, -1).mean((1, 3))
-    mask, radiance, aovs = torch.split(image, [1, 3, sum(AOVS.values())], -1)
-    straight = torch.split(aovs / mask.clamp_min(MIN_COVERAGE), list(AOVS.values()), -1)
-    result = {"radiance": radiance, "mask": mask, **dict(zip(AOVS, straight, strict=True))}
-    result["normal_world"] = normalize(result["normal_world"])
-    return result
+def environment_shader(pyramid: EnvironmentPyramid, *, multiple_scattering: bool = True) -> Shader:
+    """Shade by a prefiltered environment, without visibility."""
+
+    def radiance(normal: Tensor, wo: Tensor, materials: Materials) -> Tensor:
+        return shade(
+            normal,
+            wo,
+            materials.basecolor,
+            materials.roughness,
+            materials.metallic,
+            pyramid,
+            multiple_scattering=multiple_scattering,
+        ).radiance
+
+    return radiance
 
 
-def surface_samples(
-    mesh: SourceMesh, camera: Cameras
-) -> tuple[Int[Tensor, "P"], dict[str, Float[Tensor, "P C"]]]:
-    """Position, materials and shading normal at the pixel centres of one camera.
+@dataclass(frozen=True)
+class _MeshMaterials:
+    """The materials of a `SourceMesh` at its visible points."""
 
-    Returns:
-        Flat indices of the covered pixels, and the values there by name: those of `AOVS`, and the
-        world `position`.
-    """
-    clip = camera.project(mesh.vertices)[0]
-    fragments = rasterize(clip, mesh.faces, camera.height, camera.width, cull_backfaces=False)
-    tangent = mesh.tangents[:, :3]
-    across = bitangents(mesh.normals, mesh.tangents)
-    per_vertex = [mesh.vertices, mesh.normals, tangent, across, mesh.colors, mesh.uv]
-    pixels, values = interpolate(clip, mesh.faces, fragments, torch.cat(per_vertex, 1))
-    split = torch.split(values, list(ATTRIBUTES.values()), 1)
-    attributes = dict(zip(ATTRIBUTES, split, strict=True))
-    face = fragments.triangle.reshape(-1)[pixels].long()
-    samples = _textured(mesh, face, attributes)
-    samples["position"] = attributes["position"]
-    # A face seen from behind shows its other side: the normal turns to the viewer with it.
-    geometric = face_normals_scaled(mesh.vertices, mesh.faces)[face]
-    behind = dot(geometric, camera.positions[0] - samples["position"]) < 0.0
-    normal = samples["normal_world"]
-    samples["normal_world"] = torch.where(behind, -normal, normal)
-    return pixels, samples
+    face_material: Int[Tensor, "F"]
+    materials: tuple[SourceMaterial, ...]
+
+    def __call__(self, points: SurfacePoints) -> Materials:
+        """Evaluate one material after another, each at the points that show it."""
+        material_of = self.face_material[points.face]
+        result = points.position.new_zeros(len(points.position), 8)
+        for index, material in enumerate(self.materials):
+            chosen = torch.nonzero(material_of == index)[:, 0]
+            if len(chosen):
+                here = SurfacePoints(
+                    position=points.position[chosen],
+                    normal=points.normal[chosen],
+                    facing=points.facing[chosen],
+                    face=points.face[chosen],
+                    attributes=points.attributes[chosen],
+                )
+                result[chosen] = _evaluate(material, here)
+        return Materials(*torch.split(result, [3, 1, 1, 3], 1))
 
 
-def _textured(
-    mesh: SourceMesh, face: Int[Tensor, "P"], attributes: dict[str, Float[Tensor, "P C"]]
-) -> dict[str, Float[Tensor, "P C"]]:
-    """Materials and shading normals, one material after another."""
-    material_of = mesh.face_material.long()[face]
-    count = len(face)
-    result = {name: attributes["uv"].new_zeros(count, width) for name, width in AOVS.items()}
-    for index, material in enumerate(mesh.materials):
-        chosen = torch.nonzero(material_of == index)[:, 0]
-        if not len(chosen):
-            continue
-        here = {name: value[chosen] for name, value in attributes.items()}
-        for name, value in _evaluate(material, here).items():
-            result[name][chosen] = value
-    return result
-
-
-def _evaluate(
-    material: SourceMaterial, attributes: dict[str, Float[Tensor, "P C"]]
-) -> dict[str, Float[Tensor, "P C"]]:
-    """A glTF metallic-roughness material at P points."""
-    uv, normal = attributes["uv"], normalize(attributes["normal"])
-    basecolor = attributes["color"] * uv.new_tensor(material.basecolor_factor)
+def _evaluate(material: SourceMaterial, points: SurfacePoints) -> Float[Tensor, "P 8"]:
+    """Basecolor, roughness, metallic and normal offset of one glTF material."""
+    uv, tangent, color = torch.split(points.attributes, list(ATTRIBUTES.values()), 1)
+    basecolor = color * uv.new_tensor(material.basecolor_factor)
     if material.basecolor is not None:
         basecolor = basecolor * sample_texture(material.basecolor, uv)
     factors = uv.new_tensor([material.roughness_factor, material.metallic_factor])
     roughness_metallic = factors.expand(len(uv), 2)
     if material.roughness_metallic is not None:
         roughness_metallic = factors * sample_texture(material.roughness_metallic, uv)
+    bump = torch.zeros_like(points.normal)
     if material.normal_tangent is not None:
-        local = sample_texture(material.normal_tangent, uv)
-        normal = world_from_tangent(local, normal, attributes["tangent"], attributes["bitangent"])
-    return {
-        "basecolor": basecolor.clamp(0.0, 1.0),
-        "roughness": roughness_metallic[:, :1],
-        "metallic": roughness_metallic[:, 1:],
-        "normal_world": normal,
-    }
+        mapped = sample_texture(material.normal_tangent, uv)
+        bump = normal_from_tangent(mapped, points, tangent) - points.normal
+    return torch.cat([basecolor.clamp(0.0, 1.0), roughness_metallic, bump], 1)
