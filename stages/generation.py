@@ -78,8 +78,8 @@ def _from_mesh(mesh: SourceMesh, config: GenerationConfig, ctx: Context) -> Mate
     radius = config.radius if config.radius is not None else _fitting_radius(mesh, config)
     angles = orbit_angles(config.views, config.elevation_mean_deg, config.elevation_swing_deg)
     cameras = orbit_cameras(angles, radius=radius, fov_y_deg=config.fov_y_deg, size=config.size)
-    operator = PyramidOperator.build(config.environment_size)
-    shader = environment_shader(operator(_environment(config, ctx)))
+    light = _environment(config, ctx)
+    shader = environment_shader(PyramidOperator.build(config.environment_size)(light))
     views = []
     for view in range(len(cameras)):
         pictures = render_pictures(mesh, cameras[view], shader, supersample=config.supersample)
