@@ -39,10 +39,10 @@ class GenerationConfig(StageConfig):
     environment_sha256: str | None = None
     """Digest of that file, filled in by itself, so that another light makes another artifact."""
 
-    environment_size: int = Field(256, ge=16, le=1024)
+    environment_size: int = Field(128, ge=16, le=1024)
     """Side of the octahedral light map, pixels, a power of two."""
 
-    supersample: int = Field(4, ge=1, le=8)
+    supersample: int = Field(3, ge=1, le=8)
     """Samples per pixel and axis."""
 
     @model_validator(mode="before")

@@ -11,7 +11,7 @@ class PreviewConfig(StageConfig):
     views: int = Field(5, ge=1, le=12)
     """Views shown and measured, the reference first, spread over the orbit."""
 
-    cell: int = Field(224, ge=32, le=1024)
+    cell: int = Field(224, ge=64, le=1024)
     """Side of each picture on the sheet, pixels."""
 
     supersample: int = Field(3, ge=1, le=8)

@@ -8,14 +8,14 @@ from torch import Tensor
 
 from svim3d.numerics import dot, normalize, smoothstep
 
-FLOOR, CEILING = (0.16, 0.15, 0.14), (0.42, 0.45, 0.50)  # radiance of the room, bottom and top
+FLOOR, CEILING = (0.06, 0.055, 0.05), (0.15, 0.16, 0.18)  # radiance of the room, bottom and top
 EDGE_DEG = 4.0  # half width of a soft box's edge
 # Direction to the centre, half angles across and up in degrees, radiance.
 SOFT_BOXES = (
-    ((0.70, 0.55, 0.60), (22.0, 16.0), (11.0, 10.2, 9.0)),
-    ((-0.90, 0.30, 0.35), (12.0, 34.0), (3.2, 3.8, 4.8)),
-    ((-0.15, 0.45, -1.00), (40.0, 8.0), (6.0, 5.6, 5.0)),
-    ((0.10, 1.00, 0.05), (14.0, 14.0), (5.0, 5.0, 5.0)),
+    ((0.70, 0.55, 0.60), (22.0, 16.0), (6.4, 5.8, 5.0)),
+    ((-0.90, 0.30, 0.35), (12.0, 34.0), (1.6, 2.0, 2.6)),
+    ((-0.15, 0.45, -1.00), (40.0, 8.0), (3.2, 3.0, 2.6)),
+    ((0.10, 1.00, 0.05), (14.0, 14.0), (2.4, 2.4, 2.4)),
 )
 
 
