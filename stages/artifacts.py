@@ -67,6 +67,11 @@ class MaterialViews:
         cameras, images, reference = read_orbit(folder)
         return cls(cameras=cameras, reference=reference, **images)
 
+    def headline(self) -> str:
+        """Number and size of the views."""
+        views, height, width, _ = self.radiance.shape
+        return f"{views} views of {width} x {height}"
+
 
 @dataclass(frozen=True)
 class EnvironmentLight:
@@ -89,6 +94,10 @@ class EnvironmentLight:
     def load(cls, folder: Path) -> Self:
         """Read the octahedral map."""
         return cls(torch.from_numpy(read_rgb(folder / "environment_octahedral.exr")))
+
+    def headline(self) -> str:
+        """Size and mean brightness of the map."""
+        return f"{len(self.radiance)} px map, mean radiance {self.radiance.mean():.2f}"
 
 
 @dataclass(frozen=True)
@@ -131,6 +140,10 @@ class FittedField:
             material_spec=MaterialFieldSpec(**spec["materials"]),
             material_state={name.removeprefix("material."): t for name, t in tensors.items()},
         )
+
+    def headline(self) -> str:
+        """Resolution of the surface grid."""
+        return f"sdf grid of {len(self.sdf)}^3 nodes"
 
 
 @dataclass(frozen=True)
@@ -175,6 +188,10 @@ class RefinedSurface:
             material_spec=MaterialFieldSpec(**spec["materials"]),
             material_state={name.removeprefix("material."): t for name, t in tensors.items()},
         )
+
+    def headline(self) -> str:
+        """Number of triangles."""
+        return f"{len(self.faces)} faces"
 
 
 @dataclass(frozen=True)
@@ -228,13 +245,16 @@ class TexturedMesh:
             uv=geometry.get("uv"),
             tangents=geometry.get("tangents"),
             basecolor=(
-                read_png(folder / "basecolor.png", srgb=True)
-                if textured
-                else geometry["basecolor"]
+                read_png(folder / "basecolor.png", srgb=True) if textured else geometry["basecolor"]
             ),
             orm=read_png(folder / "orm.png") if textured else geometry["orm"],
             normal_tangent=read_png(folder / "normal.png") * 2.0 - 1.0 if textured else None,
         )
+
+    def headline(self) -> str:
+        """Number of triangles and what carries the materials."""
+        paint = "coloured per vertex" if self.uv is None else f"{len(self.basecolor)} px textures"
+        return f"{len(self.faces)} faces, {paint}"
 
 
 @dataclass(frozen=True)
@@ -259,13 +279,15 @@ class ExportedAsset:
     @classmethod
     def load(cls, folder: Path) -> Self:
         """Read them back."""
-        kept = {"summary.json", "manifest.json"}
         return cls(
             files={
                 str(f.relative_to(folder)): f.read_bytes()
                 for f in sorted(folder.rglob("*"))
-                if f.is_file() and f.name not in kept
+                if f.is_file() and f.name != "summary.json"
             },
             summary=json.loads((folder / "summary.json").read_text()),
         )
 
+    def headline(self) -> str:
+        """Size of the GLB."""
+        return f"asset.glb of {len(self.files['asset.glb']) / 2**20:.2f} MiB"
