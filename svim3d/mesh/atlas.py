@@ -9,7 +9,6 @@ has another size than was asked for, which would change the gutter.
 import subprocess
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -20,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from svim3d.compiled import kernel
+from svim3d.mesh import xatlas_process
 from svim3d.mesh.mesh import face_adjacency, face_normals_scaled, vertex_normals
 from svim3d.mesh.texels import Texels, rasterize_uv
 from svim3d.numerics import dot, normalize
@@ -102,10 +102,9 @@ def unwrap_charts(
     """
     header = np.array([len(vertices), len(faces), texture_size], "<i4")
     mesh = vertices.detach().cpu().numpy().astype("<f4"), faces.cpu().numpy().astype("<u4")
-    # By file name: the child needs neither this package's parents nor their imports.
-    worker = Path(__file__).with_name("xatlas_process.py")
+    # By file name: the child needs no package path and none of this process's imports.
     content = subprocess.run(
-        [sys.executable, "-P", str(worker)],
+        [sys.executable, "-P", xatlas_process.__file__],
         input=header.tobytes() + b"".join(array.tobytes() for array in mesh),
         stdout=subprocess.PIPE,
         timeout=timeout_s,
