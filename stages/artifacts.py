@@ -228,9 +228,7 @@ class TexturedMesh:
             uv=geometry.get("uv"),
             tangents=geometry.get("tangents"),
             basecolor=(
-                read_png(folder / "basecolor.png", srgb=True)
-                if textured
-                else geometry["basecolor"]
+                read_png(folder / "basecolor.png", srgb=True) if textured else geometry["basecolor"]
             ),
             orm=read_png(folder / "orm.png") if textured else geometry["orm"],
             normal_tangent=read_png(folder / "normal.png") * 2.0 - 1.0 if textured else None,
@@ -268,4 +266,3 @@ class ExportedAsset:
             },
             summary=json.loads((folder / "summary.json").read_text()),
         )
-
