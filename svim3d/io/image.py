@@ -1,0 +1,122 @@
+"""The Pillow door: 8-bit pictures in and out, 16-bit grey in."""
+
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont, UnidentifiedImageError
+from torch import Tensor
+
+from svim3d.color import linear_from_srgb, srgb_from_linear
+
+MODES = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}
+CHANNELS_WITH_OPACITY = (2, 4)  # their last channel is never gamma encoded
+MAX_8BIT, MAX_16BIT = 255.0, 65535.0
+COMPRESSION_LEVEL = 6  # fixed, so that equal pictures give equal bytes
+
+
+def decode_image(content: bytes, *, srgb: bool = False) -> Float[Tensor, "H W C"]:
+    """Decode PNG or JPEG bytes to [0, 1]; C is 1, 2, 3 or 4 as stored, palettes are expanded.
+
+    Args:
+        content: the file's bytes. 16-bit grey keeps its depth; 16-bit colour is read as 8-bit.
+        srgb: decode the sRGB curve of the colour channels (opacity stays), giving linear light.
+
+    Raises:
+        ValueError: the bytes are no picture, or a truncated one.
+    """
+    try:
+        with Image.open(io.BytesIO(content)) as picture:
+            values = _plain_array(picture)
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise ValueError(f"wanted a PNG or JPEG picture, cannot decode it: {error}") from error
+    image = torch.from_numpy(values)
+    return _on_colour(image, linear_from_srgb) if srgb else image
+
+
+def _plain_array(picture: Image.Image) -> NDArray[np.float32]:
+    """Pixels of any mode as float32 [H, W, C] in [0, 1]."""
+    if picture.mode.startswith("I"):
+        return np.asarray(picture, np.float32)[..., None] / np.float32(MAX_16BIT)
+    if picture.mode not in MODES.values():
+        transparent = "transparency" in picture.info or picture.mode in ("PA", "RGBa")
+        picture = picture.convert("RGBA" if transparent else "RGB")
+    values = np.asarray(picture, np.float32) / np.float32(MAX_8BIT)
+    return np.atleast_3d(values)
+
+
+def _on_colour(
+    image: Float[Tensor, "H W C"], curve: Callable[[Tensor], Tensor]
+) -> Float[Tensor, "H W C"]:
+    """Apply a transfer curve to all channels but opacity."""
+    if image.shape[-1] in CHANNELS_WITH_OPACITY:
+        return torch.cat([curve(image[..., :-1]), image[..., -1:]], -1)
+    return curve(image)
+
+
+def encode_png(image: Float[Tensor, "H W C"], *, srgb: bool = False) -> bytes:
+    """8-bit PNG of an image in [0, 1] (clamped), rounded to nearest; equal images, equal bytes.
+
+    Args:
+        image: 1 (grey), 2 (grey, opacity), 3 (colour) or 4 (colour, opacity) channels.
+        srgb: encode the colour channels, given in linear light, by the sRGB curve.
+    """
+    if image.ndim != 3 or image.shape[-1] not in MODES:
+        raise ValueError(
+            f"wanted an image [H, W, 1 to 4], got {list(image.shape)}; put channels last"
+        )
+    image = image.detach().cpu().float()
+    values = _on_colour(image, srgb_from_linear) if srgb else image
+    pixels = (values.clamp(0.0, 1.0) * MAX_8BIT).round().to(torch.uint8).numpy()
+    grey = pixels.shape[-1] == 1
+    picture = Image.fromarray(pixels[..., 0] if grey else pixels, MODES[pixels.shape[-1]])
+    buffer = io.BytesIO()
+    picture.save(buffer, "PNG", compress_level=COMPRESSION_LEVEL)
+    return buffer.getvalue()
+
+
+def read_png(file: Path, *, srgb: bool = False) -> Float[Tensor, "H W C"]:
+    """Read a picture as `decode_image` does.
+
+    Raises:
+        ValueError: the file is missing, truncated or no picture.
+    """
+    if not file.is_file():
+        raise ValueError(f"wanted a picture, but {file} does not exist; check the path")
+    try:
+        return decode_image(file.read_bytes(), srgb=srgb)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+
+
+def write_png(file: Path, image: Float[Tensor, "H W C"], *, srgb: bool = False) -> None:
+    """Write an 8-bit PNG as `encode_png` does; replaced if it exists."""
+    file.write_bytes(encode_png(image, srgb=srgb))
+
+
+@dataclass(frozen=True)
+class Label:
+    """A line of text on a picture; (x, y) is the left end of its middle line, pixels."""
+
+    x: int
+    y: int
+    text: str
+    size_px: int
+
+
+def with_labels(
+    image: Float[Tensor, "H W 3"], labels: Sequence[Label], *, ink: float
+) -> Float[Tensor, "H W 3"]:
+    """A display-encoded picture with text of grey value `ink` on it, rounded to 8 bit."""
+    picture = Image.open(io.BytesIO(encode_png(image)))
+    draw = ImageDraw.Draw(picture)
+    grey = (round(ink * MAX_8BIT),) * 3
+    for label in labels:
+        font = ImageFont.load_default(label.size_px)
+        draw.text((label.x, label.y), label.text, fill=grey, font=font, anchor="lm")
+    return torch.from_numpy(_plain_array(picture))

@@ -1,0 +1,216 @@
+"""The orbit folder: cameras and material views on disk, the exchange format of the project.
+
+`orbit.json` holds `camera` {width, height, fov_deg (vertical)}, the frames and the reference;
+each frame names a multi-channel half-float EXR. Radiance (`R G B`) is premultiplied by the
+coverage `A`; basecolor, roughness, metallic and the world normal are straight. Two layouts are
+read: `frames` with `reference` as an index (what `write_orbit` makes), and the layout of
+benchmark sets: `train`, and `test` whose frames name one file per environment.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from svim3d.cameras import Cameras
+from svim3d.io.exr import read_exr, write_exr
+from svim3d.io.orbit_repair import Notify, repair_images
+
+CHANNELS = {
+    "radiance": ("R", "G", "B"),
+    "mask": ("A",),
+    "basecolor": ("basecolor.R", "basecolor.G", "basecolor.B"),
+    "roughness": ("roughness.V",),
+    "metallic": ("metallic.V",),
+    "normal_world": ("normal.X", "normal.Y", "normal.Z"),
+}
+INDEX = "orbit.json"
+RIGID_TOLERANCE = 1e-3  # poses written with 4 decimals pass, mirrored or scaled ones do not
+
+Images = dict[str, Float[Tensor, "V H W C"]]
+
+
+def write_orbit(
+    folder: Path, cameras: Cameras, images: Mapping[str, Tensor], *, reference: int
+) -> None:
+    """Write `orbit.json` and one half-float EXR per view into `folder`, made if need be.
+
+    Args:
+        folder: where to.
+        cameras: V poses.
+        images: the six named images of `CHANNELS`, each [V, H, W, C].
+        reference: index of the view that the asset was asked for by.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = []
+    for view in range(len(cameras)):
+        name = f"{view:03d}.exr"
+        planes = {
+            channel: images[image][view, ..., i].detach().cpu().numpy()
+            for image, channels in CHANNELS.items()
+            for i, channel in enumerate(channels)
+        }
+        write_exr(folder / name, planes)
+        frames.append({"file": name, **_angles(cameras, view), "c2w": cameras.c2w[view].tolist()})
+    index = {
+        "camera": {
+            "width": cameras.width,
+            "height": cameras.height,
+            "fov_deg": cameras.fov_y_deg,
+        },
+        "reference": reference,
+        "frames": frames,
+    }
+    (folder / INDEX).write_text(json.dumps(index, indent=1))
+
+
+def _angles(cameras: Cameras, view: int) -> dict[str, float]:
+    """Elevation and azimuth of a camera centre, for human readers."""
+    x, y, z = cameras.positions[view].tolist()
+    return {
+        "elevation_deg": round(math.degrees(math.atan2(y, math.hypot(x, z))), 6),
+        "azimuth_deg": round(math.degrees(math.atan2(x, z)), 6),
+    }
+
+
+def read_orbit(
+    folder: Path, split: str = "train", *, notify: Notify | None = None
+) -> tuple[Cameras, Images, int]:
+    """Read cameras, the six images of `CHANNELS` as float32, and the reference index.
+
+    Args:
+        folder: an orbit folder of either layout.
+        split: `train`, or `test_A` for the test views under environment A.
+        notify: told (kind, message) of every value that had to be mended; see `repair_images`.
+
+    Raises:
+        ValueError: the folder cannot be used; the text says what was wanted, what came and what
+            to do.
+    """
+    index = _read_index(folder)
+    frames = _frames(folder, index, split)
+    cameras = _cameras(folder, index, frames)
+    views = [_read_view(folder / f["file"], cameras.height, cameras.width) for f in frames]
+    images = {name: torch.stack([view[name] for view in views]) for name in CHANNELS}
+    names = [frame["file"] for frame in frames]
+    return cameras, repair_images(images, names, notify), _reference(index, len(frames), split)
+
+
+def _read_index(folder: Path) -> dict[str, Any]:
+    """The parsed `orbit.json`."""
+    file = folder / INDEX
+    if not file.is_file():
+        raise ValueError(
+            f"wanted an orbit folder, but {folder} holds no {INDEX}; "
+            "give the folder that contains it"
+        )
+    try:
+        index = json.loads(file.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"wanted JSON in {file}, cannot parse it: {error}") from error
+    if not isinstance(index, dict):
+        raise ValueError(f"wanted an object in {file}, got a {type(index).__name__}")
+    return index
+
+
+def _frames(folder: Path, index: dict[str, Any], split: str) -> list[dict[str, Any]]:
+    """Frames of a split, each with its `file` and `c2w`."""
+    name, _, environment = split.partition("_")
+    key = "frames" if name == "train" and "frames" in index else name
+    listed = index.get(key)
+    if not listed:
+        raise ValueError(
+            f"wanted frames in {folder / INDEX}, but the list '{key}' is empty or missing; "
+            "render the orbit again"
+        )
+    frames = []
+    for number, frame in enumerate(listed):
+        file = frame.get("files", {}).get(environment) if environment else frame.get("file")
+        if file is None or "c2w" not in frame:
+            raise ValueError(
+                f"wanted a file and a c2w for frame {number} of '{split}' in {folder / INDEX}, "
+                f"got only {sorted(frame)}"
+            )
+        if not (folder / file).is_file():
+            raise ValueError(
+                f"wanted frame {number} of {folder / INDEX}, but its file {file} does not exist; "
+                "copy the whole folder or take the frame off the list"
+            )
+        frames.append({"file": file, "c2w": frame["c2w"]})
+    return frames
+
+
+def _cameras(folder: Path, index: dict[str, Any], frames: list[dict[str, Any]]) -> Cameras:
+    """Cameras of the frames, checked to be rigid with a centred principal point."""
+    camera = index.get("camera", {})
+    missing = [key for key in ("width", "height", "fov_deg") if key not in camera]
+    if missing:
+        raise ValueError(f"wanted camera.{missing} in {folder / INDEX}, got {sorted(camera)}")
+    width, height = int(camera["width"]), int(camera["height"])
+    centre = (camera.get("cx", width / 2), camera.get("cy", height / 2))
+    if max(abs(centre[0] - width / 2), abs(centre[1] - height / 2)) > 0.5:
+        raise ValueError(
+            f"wanted the principal point at the image centre ({width / 2}, {height / 2}), "
+            f"got {centre} in {folder / INDEX}; crop or pad the views"
+        )
+    poses = []
+    for frame in frames:
+        pose = torch.tensor(frame["c2w"], dtype=torch.float64)
+        if pose.shape != (4, 4) or not _is_rigid(pose):
+            raise ValueError(
+                f"wanted a rigid 4x4 camera-to-world transform for {frame['file']} in "
+                f"{folder / INDEX}, got {frame['c2w']}; remove scale and mirroring from it"
+            )
+        poses.append(pose.float())
+    return Cameras(torch.stack(poses), float(camera["fov_deg"]), height, width)
+
+
+def _is_rigid(pose: Float[Tensor, "4 4"]) -> bool:
+    """Whether a transform is a rotation and a translation."""
+    rotation = pose[:3, :3]
+    error = (rotation.T @ rotation - torch.eye(3, dtype=pose.dtype)).abs().max()
+    last_row = (pose[3] - pose.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max()
+    finite = bool(torch.isfinite(pose).all())
+    return (
+        finite
+        and float(error) < RIGID_TOLERANCE
+        and float(last_row) < RIGID_TOLERANCE
+        and float(torch.linalg.det(rotation)) > 0
+    )
+
+
+def _read_view(file: Path, height: int, width: int) -> dict[str, Float[Tensor, "H W C"]]:
+    """The images of one view."""
+    planes = read_exr(file)
+    wanted = [channel for channels in CHANNELS.values() for channel in channels]
+    missing = [channel for channel in wanted if channel not in planes]
+    if missing:
+        raise ValueError(
+            f"wanted the channels {', '.join(wanted)} in {file}, missing {', '.join(missing)}; "
+            "export them, or render the orbit from a mesh"
+        )
+    shapes = {planes[channel].shape for channel in wanted}
+    if shapes != {(height, width)}:
+        raise ValueError(
+            f"wanted {width}x{height} pixels in {file} as {INDEX} says, got "
+            f"{', '.join(f'{w}x{h}' for h, w in sorted(shapes))}; all views need one size"
+        )
+    return {
+        name: torch.from_numpy(np.stack([planes[channel] for channel in channels], -1))
+        for name, channels in CHANNELS.items()
+    }
+
+
+def _reference(index: dict[str, Any], views: int, split: str) -> int:
+    """Index of the reference view; the last one where nothing is said."""
+    said = index.get("reference", views - 1) if split == "train" else views - 1
+    reference = int(said.get("train_index", views - 1) if isinstance(said, dict) else said)
+    if not 0 <= reference < views:
+        raise ValueError(f"wanted a reference below the {views} views, got {reference}")
+    return reference
