@@ -13,11 +13,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from svim3d.cameras import Cameras
-from svim3d.fields.material_field import MaterialFieldSpec
+from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
 from svim3d.io.exr import read_rgb, write_rgb
 from svim3d.io.image import read_png, write_png
 from svim3d.io.orbit import read_orbit, write_orbit
 from svim3d.io.weights import load_tensors, save_tensors
+from svim3d.mesh.marching import extract_surface
 from svim3d.shading.environment import latlong_from_octahedral
 
 
@@ -141,6 +142,20 @@ class FittedField:
             material_state={name.removeprefix("material."): t for name, t in tensors.items()},
         )
 
+    def own_surface(self) -> "RefinedSurface":
+        """The grid's zero set with phase 1's materials and light: what is there without phase 2.
+
+        It has no faces where the grid has no inside.
+        """
+        vertices, faces = extract_surface(self.sdf, self.half_extent)
+        return RefinedSurface(
+            vertices=vertices,
+            faces=faces,
+            material_spec=self.material_spec,
+            material_state=self.material_state,
+            environment=self.environment,
+        )
+
     def headline(self) -> str:
         """Resolution of the surface grid."""
         return f"sdf grid of {len(self.sdf)}^3 nodes"
@@ -188,6 +203,12 @@ class RefinedSurface:
             material_spec=MaterialFieldSpec(**spec["materials"]),
             material_state={name.removeprefix("material."): t for name, t in tensors.items()},
         )
+
+    def material_field(self, device: torch.device) -> MaterialField:
+        """The material field with its parameters, on a device, for evaluation."""
+        field = MaterialField(self.material_spec)
+        field.load_state_dict(self.material_state)
+        return field.to(device).requires_grad_(False)
 
     def headline(self) -> str:
         """Number of triangles."""

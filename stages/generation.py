@@ -65,7 +65,7 @@ def _from_orbit(folder: Path, ctx: Context) -> MaterialViews:
 
 def _normalised(mesh: SourceMesh, source: Path) -> SourceMesh:
     """The same mesh, centred, with its bounding box's longest side 1."""
-    used = mesh.vertices[mesh.faces.reshape(-1).long().unique()]
+    used = mesh.vertices[torch.unique(mesh.faces.long())]
     low, high = used.amin(0), used.amax(0)
     extent = float((high - low).max())
     if not extent > MIN_EXTENT:

@@ -6,6 +6,7 @@ shows here. The render knows no shadows and no interreflection, the views may.
 """
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -31,9 +32,10 @@ LIGHT_FILE = "environment.exr"
 PAPER, INK = 0.11, 0.86  # display-encoded greys of the sheet's background and text
 MARGIN, LABEL_WIDTH, HEADER = 8, 104, 36  # pixels
 TEXT_PX, TITLE_PX = 13, 15
+AIR = 1.06  # pictures are cropped to the object and this much around it
 MIN_COVERAGE = 0.5  # pixels that the object mostly covers are compared
 
-Images = dict[str, Float[Tensor, "V H W C"]]
+Images = dict[str, Float[Tensor, "_ _ _ _"]]  # [views, rows, columns, channels]
 
 
 @dataclass(frozen=True)
@@ -159,26 +161,39 @@ def _sheet(
         "normal": f"{figures['normal_angle_deg']:.1f} deg",
     }
     step = config.cell + MARGIN
-    light_width = len(chosen) * step - MARGIN
-    panorama = agx(latlong_from_octahedral(light, height=max(16, light_width // 2)))
-    height = HEADER + len(on_paper) * step + panorama.shape[0] + MARGIN
-    sheet = torch.full((height, LABEL_WIDTH + len(chosen) * step, 3), PAPER)
+    # A lat-long picture is two cells wide.
+    sheet_width = LABEL_WIDTH + max(2, len(chosen)) * step
+    sheet = torch.full((HEADER + (len(on_paper) + 1) * step, sheet_width, 3), PAPER)
+    window = _window(torch.maximum(given["mask"], rendered["mask"]))
     labels = [
         Label(LABEL_WIDTH + i * step, HEADER // 2, f"view {view}", TEXT_PX)
         for i, view in enumerate(chosen)
     ]
     for row, (name, (pictures, mask)) in enumerate(on_paper.items()):
         y = HEADER + row * step
-        cells = _cells(pictures, mask, config.cell)
+        cells = _cells(pictures[window], mask[window], config.cell)
         for column, cell in enumerate(cells):
             x = LABEL_WIDTH + column * step
             sheet[y : y + config.cell, x : x + config.cell] = cell
         labels.append(Label(MARGIN, y + config.cell // 2, name, TITLE_PX))
         labels.append(Label(MARGIN, y + config.cell // 2 + 20, notes.get(name, ""), TEXT_PX))
     y = HEADER + len(on_paper) * step
-    sheet[y : y + panorama.shape[0], LABEL_WIDTH : LABEL_WIDTH + panorama.shape[1]] = panorama
-    labels.append(Label(MARGIN, y + panorama.shape[0] // 2, "light", TITLE_PX))
+    panorama = agx(latlong_from_octahedral(light, height=config.cell))
+    sheet[y : y + config.cell, LABEL_WIDTH : LABEL_WIDTH + 2 * config.cell] = panorama
+    labels.append(Label(MARGIN, y + config.cell // 2, "light", TITLE_PX))
     return with_labels(sheet, labels, ink=INK)
+
+
+def _window(mask: Float[Tensor, "V H W 1"]) -> tuple[slice, slice, slice]:
+    """The centred square of all views that holds whatever any of them covers, and some air."""
+    _, height, width, _ = mask.shape
+    row, column = torch.nonzero(mask.amax((0, 3)) > 0.0).unbind(1)
+    reach = max(
+        float((row + 0.5 - height / 2).abs().max()), float((column + 0.5 - width / 2).abs().max())
+    )
+    half = min(math.ceil(reach * AIR), height // 2, width // 2)
+    top, left = height // 2 - half, width // 2 - half
+    return slice(None), slice(top, top + 2 * half), slice(left, left + 2 * half)
 
 
 def _cells(
@@ -188,7 +203,7 @@ def _cells(
     colour = pictures.expand(*pictures.shape[:-1], 3)
     laid = PAPER + mask * (colour - PAPER)
     scaled = torch.nn.functional.interpolate(
-        laid.permute(0, 3, 1, 2), size=(size, size), mode="area"
+        laid.permute(0, 3, 1, 2), size=(size, size), mode="bilinear", antialias=True
     )
     return scaled.permute(0, 2, 3, 1)
 

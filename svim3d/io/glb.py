@@ -6,17 +6,21 @@ written as given, and the Khronos validator finds nothing to remark. Reading bac
 other libraries.
 """
 
+import io
 import json
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from svim3d.color import linear_from_srgb
 from svim3d.io.gltf import BINARY_CHUNK, GLB_MAGIC, JSON_CHUNK, read_gltf
 from svim3d.io.image import encode_png
 from svim3d.io.obj import read_obj
@@ -120,6 +124,58 @@ def glb_bytes(
             "meshes": [{"name": name, "primitives": [primitive]}],
             "materials": [material],
         }
+    )
+
+
+@dataclass(frozen=True)
+class ReopenedGlb:
+    """What another reader (trimesh) makes of a GLB, in the terms of `glb_bytes`.
+
+    Attributes:
+        vertices: positions.
+        faces: vertex indices.
+        uv: glTF texture coordinates, or None.
+        basecolor: linear; texture or per vertex.
+        orm: texture, or None where the material has factors.
+        normal_tangent: texture, or None.
+    """
+
+    vertices: Float[Tensor, "N 3"]
+    faces: Int[Tensor, "F 3"]
+    uv: Float[Tensor, "N 2"] | None
+    basecolor: Float[Tensor, "*texels 3"]
+    orm: Float[Tensor, "T T 3"] | None
+    normal_tangent: Float[Tensor, "T T 3"] | None
+
+
+def reopen_glb(content: bytes) -> ReopenedGlb:
+    """Read a GLB of one mesh with trimesh, to check what was written."""
+    scene = trimesh.load(io.BytesIO(content), file_type="glb", process=False, force="scene")
+    (mesh,) = scene.geometry.values()
+    material = getattr(mesh.visual, "material", None)
+
+    def texture(name: str) -> Tensor | None:
+        picture = getattr(material, name, None)
+        if picture is None:
+            return None
+        return torch.from_numpy(np.asarray(picture.convert("RGB"), np.float32) / 255.0)
+
+    basecolor, normal = texture("baseColorTexture"), texture("normalTexture")
+    if basecolor is None:
+        colors = mesh.visual.vertex_attributes["color"]  # COLOR_0, linear as stored
+        painted = torch.from_numpy(np.array(colors, np.float32))
+    else:
+        painted = linear_from_srgb(basecolor)
+    uv = getattr(mesh.visual, "uv", None)
+    # trimesh turns v upwards.
+    upright = None if uv is None else np.asarray(uv, np.float64) * [1.0, -1.0] + [0.0, 1.0]
+    return ReopenedGlb(
+        vertices=torch.from_numpy(np.asarray(mesh.vertices, np.float32)),
+        faces=torch.from_numpy(np.asarray(mesh.faces, np.int64)),
+        uv=None if upright is None else torch.from_numpy(upright.astype(np.float32)),
+        basecolor=painted,
+        orm=texture("metallicRoughnessTexture"),
+        normal_tangent=None if normal is None else normal * 2.0 - 1.0,
     )
 
 
