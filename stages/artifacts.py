@@ -14,12 +14,16 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from svim3d.cameras import Cameras
-from svim3d.fields.material_field import MaterialFieldSpec
+from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
 from svim3d.io.exr import read_rgb, write_rgb
 from svim3d.io.image import read_png, write_png
 from svim3d.io.orbit import read_orbit, write_orbit
 from svim3d.io.weights import load_tensors, save_tensors
+<<<<<<< HEAD
 from svim3d.numerics import normalize
+=======
+from svim3d.mesh.marching import extract_surface
+>>>>>>> field
 from svim3d.shading.environment import latlong_from_octahedral
 
 
@@ -93,6 +97,11 @@ class MaterialViews:
         cameras, images, reference = read_orbit(folder)
         return cls(cameras=cameras, reference=reference, **images)
 
+    def headline(self) -> str:
+        """Number and size of the views."""
+        views, height, width, _ = self.radiance.shape
+        return f"{views} views of {width} x {height}"
+
 
 @dataclass(frozen=True)
 class EnvironmentLight:
@@ -115,6 +124,10 @@ class EnvironmentLight:
     def load(cls, folder: Path) -> Self:
         """Read the octahedral map."""
         return cls(torch.from_numpy(read_rgb(folder / "environment_octahedral.exr")))
+
+    def headline(self) -> str:
+        """Size and mean brightness of the map."""
+        return f"{len(self.radiance)} px map, mean radiance {self.radiance.mean():.2f}"
 
 
 @dataclass(frozen=True)
@@ -157,6 +170,24 @@ class FittedField:
             material_spec=MaterialFieldSpec(**spec["materials"]),
             material_state={name.removeprefix("material."): t for name, t in tensors.items()},
         )
+
+    def own_surface(self) -> "RefinedSurface":
+        """The grid's zero set with phase 1's materials and light: what is there without phase 2.
+
+        It has no faces where the grid has no inside.
+        """
+        vertices, faces = extract_surface(self.sdf, self.half_extent)
+        return RefinedSurface(
+            vertices=vertices,
+            faces=faces,
+            material_spec=self.material_spec,
+            material_state=self.material_state,
+            environment=self.environment,
+        )
+
+    def headline(self) -> str:
+        """Resolution of the surface grid."""
+        return f"sdf grid of {len(self.sdf)}^3 nodes"
 
 
 @dataclass(frozen=True)
@@ -201,6 +232,16 @@ class RefinedSurface:
             material_spec=MaterialFieldSpec(**spec["materials"]),
             material_state={name.removeprefix("material."): t for name, t in tensors.items()},
         )
+
+    def material_field(self, device: torch.device) -> MaterialField:
+        """The material field with its parameters, on a device, for evaluation."""
+        field = MaterialField(self.material_spec)
+        field.load_state_dict(self.material_state)
+        return field.to(device).requires_grad_(False)
+
+    def headline(self) -> str:
+        """Number of triangles."""
+        return f"{len(self.faces)} faces"
 
 
 @dataclass(frozen=True)
@@ -260,6 +301,11 @@ class TexturedMesh:
             normal_tangent=read_png(folder / "normal.png") * 2.0 - 1.0 if textured else None,
         )
 
+    def headline(self) -> str:
+        """Number of triangles and what carries the materials."""
+        paint = "coloured per vertex" if self.uv is None else f"{len(self.basecolor)} px textures"
+        return f"{len(self.faces)} faces, {paint}"
+
 
 @dataclass(frozen=True)
 class ExportedAsset:
@@ -283,12 +329,18 @@ class ExportedAsset:
     @classmethod
     def load(cls, folder: Path) -> Self:
         """Read them back."""
-        kept = {"summary.json", "manifest.json"}
         return cls(
             files={
                 str(f.relative_to(folder)): f.read_bytes()
                 for f in sorted(folder.rglob("*"))
-                if f.is_file() and f.name not in kept
+                if f.is_file() and f.name != "summary.json"
             },
             summary=json.loads((folder / "summary.json").read_text()),
         )
+<<<<<<< HEAD
+=======
+
+    def headline(self) -> str:
+        """Size of the GLB."""
+        return f"asset.glb of {len(self.files['asset.glb']) / 2**20:.2f} MiB"
+>>>>>>> field

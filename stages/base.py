@@ -3,9 +3,9 @@
 import csv
 import hashlib
 import inspect
+import json
 import logging
 import math
-import os
 import time
 import typing
 from collections.abc import Callable, Mapping
@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 
 CHECKPOINT_EVERY_S = 20.0  # a killed stage loses at most this much work
 MAX_NON_FINITE_STEPS = 20  # beyond this the optimisation is diverging, not hiccuping
+NON_FINITE_STEP = "non_finite_step"  # kind of the event that such a step leaves
 
 
 class Artifact(Protocol):
@@ -35,6 +36,9 @@ class Artifact(Protocol):
     @classmethod
     def load(cls, folder: Path) -> Self:
         """Read the payload back, on the CPU."""
+
+    def headline(self) -> str:
+        """What it is, in a few words and numbers: a cell of the run's closing table."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +54,21 @@ class Progress:
 class Checkpoints:
     """Named tensors of a half-done stage: the last good step, replaced atomically."""
 
-    def __init__(self, folder: Path, every_s: float = CHECKPOINT_EVERY_S) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        every_s: float = CHECKPOINT_EVERY_S,
+        before_save: Callable[[], None] | None = None,
+    ) -> None:
         self._file = folder / "checkpoint.safetensors"
         self._every_s = every_s
+        self._before_save = before_save
         self._last_s = time.monotonic()
+
+    @property
+    def exists(self) -> bool:
+        """Whether an earlier attempt left something to go on with."""
+        return self._file.exists()
 
     def due(self) -> bool:
         """Whether enough time has passed since the last one."""
@@ -62,17 +77,24 @@ class Checkpoints:
     def save(self, step: int, tensors: Mapping[str, Tensor]) -> None:
         """Replace the checkpoint by the state before `step`."""
         self._file.parent.mkdir(parents=True, exist_ok=True)
+        if self._before_save is not None:
+            self._before_save()
         temporary = self._file.with_suffix(".tmp")
         save_tensors(temporary, {**tensors, "__step__": torch.tensor(step)})
-        os.replace(temporary, self._file)
+        temporary.replace(self._file)
         self._last_s = time.monotonic()
 
     def load(self) -> tuple[int, dict[str, Tensor]] | None:
         """The step to go on with and its state, or None at the beginning."""
-        if not self._file.exists():
+        if not self.exists:
             return None
-        tensors = load_tensors(self._file)
-        return int(tensors.pop("__step__")), tensors
+        try:
+            tensors = load_tensors(self._file)
+            return int(tensors.pop("__step__")), tensors
+        except Exception as error:  # of any kind: a damaged checkpoint costs time, nothing else
+            log.warning("checkpoint %s is unreadable (%s): starting anew", self._file, error)
+            self._file.unlink()
+            return None
 
 
 @dataclass
@@ -99,10 +121,13 @@ class Context:
 
     def __post_init__(self) -> None:
         self.work.mkdir(parents=True, exist_ok=True)
-        self.checkpoints = Checkpoints(self.work)
+        self.checkpoints = Checkpoints(self.work, before_save=self._flush_scalars)
         self._scalars: typing.TextIO | None = None
         self._last_progress_s = -math.inf
-        self._non_finite = 0
+        self._event_log = self.work / "events.jsonl"
+        if self._event_log.exists():
+            lines = self._event_log.read_text().splitlines()
+            self.events.extend(json.loads(line) for line in lines if line.endswith("}"))
 
     def __enter__(self) -> Self:
         return self
@@ -122,20 +147,46 @@ class Context:
         return torch.Generator(device=device).manual_seed(int.from_bytes(digest[:7], "big"))
 
     def event(self, kind: str, message: str) -> None:
-        """Record something the operator should know and the manifest must keep."""
+        """Record something the operator should know and the manifest must keep.
+
+        The record outlives a killed process; a resumed one that meets the same event again (name
+        the step in the message) does not repeat it.
+        """
+        entry = {"kind": kind, "message": message}
+        if entry in self.events:
+            return
         log.warning("%s: %s", self.stage, message)
-        self.events.append({"kind": kind, "message": message})
+        self.events.append(entry)
+        with self._event_log.open("a") as stream:
+            stream.write(json.dumps(entry) + "\n")
 
     def report(self, step: int, total: int, terms: Mapping[str, float]) -> None:
-        """Append scalars to `scalars.csv` and show progress; cheap enough for every step."""
+        """Append scalars to `scalars.csv` and show progress; cheap enough for every step.
+
+        Rows are `step,term,value`. `step` counts up through the whole stage, to `total`: a resumed
+        stage rewrites the rows from its first step on.
+        """
         if self._scalars is None:
-            self._scalars = (self.work / "scalars.csv").open("a", newline="")
-        writer = csv.writer(self._scalars)
+            self._scalars = self._open_scalars(step)
+        writer = csv.writer(self._scalars, lineterminator="\n")
         writer.writerows([step, name, f"{value:.6g}"] for name, value in terms.items())
         now = time.monotonic()
         if self.on_progress is not None and (now - self._last_progress_s > 0.2 or step == total):
             self._last_progress_s = now
             self.on_progress(Progress(self.stage, step, total, dict(terms)))
+
+    def _open_scalars(self, first_step: int) -> typing.TextIO:
+        """Continue what a killed attempt left; its rows from `first_step` on are made again."""
+        file = self.work / "scalars.csv"
+        rows = file.read_text().splitlines(keepends=True) if file.exists() else []
+        kept = [r for r in rows if r.endswith("\n") and int(r.partition(",")[0]) < first_step]
+        file.write_text("".join(kept))
+        return file.open("a", newline="")
+
+    def _flush_scalars(self) -> None:
+        """A checkpoint promises that nothing before it must be done again: neither must rows."""
+        if self._scalars is not None:
+            self._scalars.flush()
 
     def is_finite(self, step: int, terms: Mapping[str, Tensor]) -> bool:
         """Whether all loss terms are finite; a bad step is counted and should be skipped.
@@ -146,9 +197,9 @@ class Context:
         bad = [name for name, value in terms.items() if not bool(torch.isfinite(value).all())]
         if not bad:
             return True
-        self._non_finite += 1
-        self.event("non_finite_step", f"step {step} skipped: non-finite {', '.join(bad)}")
-        if self._non_finite > MAX_NON_FINITE_STEPS:
+        self.event(NON_FINITE_STEP, f"step {step} skipped: non-finite {', '.join(bad)}")
+        skipped = sum(entry["kind"] == NON_FINITE_STEP for entry in self.events)
+        if skipped > MAX_NON_FINITE_STEPS:
             raise DivergenceError(
                 f"{self.stage}: more than {MAX_NON_FINITE_STEPS} steps had a non-finite "
                 f"{', '.join(bad)}; lower the learning rate or check the input for NaN"
@@ -170,7 +221,7 @@ class Stage:
         return typing.get_type_hints(self.run)
 
     @property
-    def inputs(self) -> dict[str, type]:
+    def inputs(self) -> dict[str, type[Any]]:
         """Input names with the class that each is loaded as."""
         hints = self._hints()
         positional = [
@@ -187,8 +238,8 @@ class Stage:
         return output
 
 
-def _without_none(annotation: Any) -> type:
+def _without_none(annotation: Any) -> type[Any]:
     """`A | None` -> `A`."""
     options = [a for a in typing.get_args(annotation) if a is not type(None)]
-    chosen: type = options[0] if options else annotation
+    chosen: type[Any] = options[0] if options else annotation
     return chosen

@@ -1,0 +1,179 @@
+"""Settings of a run: defaults in the code, then a preset, then overrides from the command line."""
+
+import dataclasses
+import difflib
+import importlib.resources
+import typing
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from stages.errors import InputError
+from stages.settings.dmtet import DmtetConfig
+from stages.settings.env_preopt import EnvPreoptConfig
+from stages.settings.export import ExportConfig
+from stages.settings.generation import GenerationConfig
+from stages.settings.nerf import NerfConfig
+from stages.settings.uv_bake import UvBakeConfig
+
+PRESETS = ("preview", "standard", "paper")  # from quick to thorough
+ABOUT = "about"  # the one key of a preset file that is no setting: a line for `svim3d presets`
+NEAREST_NAMES = 3
+
+
+class RunConfig(BaseModel):
+    """What every pipeline's settings have beside one field per stage."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    skip: frozenset[str] = Field(frozenset(), description="stages to leave out")
+
+
+class PipelineConfig(RunConfig):
+    """Settings of all stages from views to asset."""
+
+    generation: GenerationConfig = GenerationConfig()
+    env_preopt: EnvPreoptConfig = EnvPreoptConfig()
+    nerf: NerfConfig = NerfConfig()
+    dmtet: DmtetConfig = DmtetConfig()
+    uv_bake: UvBakeConfig = UvBakeConfig()
+    export: ExportConfig = ExportConfig()
+
+
+ConfigT = TypeVar("ConfigT", bound=RunConfig)
+
+
+def load_config(
+    schema: type[ConfigT], preset: str, overrides: Sequence[str] = (), skip: Iterable[str] = ()
+) -> ConfigT:
+    """Defaults of `schema`, changed by a preset, then by `key.path=value` overrides.
+
+    Args:
+        schema: the settings of a pipeline.
+        preset: name of a file in `configs`.
+        overrides: as given to `--set`; values are YAML.
+        skip: stages to leave out beside those that the preset leaves out.
+
+    Raises:
+        InputError: an unknown name (with the nearest valid ones) or a value out of bounds.
+    """
+    values = preset_values(preset)
+    for override in overrides:
+        path, value = _parse_override(override)
+        _require_known(schema, path, origin="--set")
+        _set(values, path, value)
+    values["skip"] = sorted({*values.get("skip", ()), *skip})
+    try:
+        return schema.model_validate(values)
+    except ValidationError as error:
+        raise InputError(_in_short(error, schema)) from error
+
+
+def preset_values(preset: str) -> dict[str, Any]:
+    """What a preset changes, as nested names and values."""
+    values = _read_preset(preset)
+    values.pop(ABOUT, None)
+    return values
+
+
+def preset_about(preset: str) -> str:
+    """What a preset is for, in a line."""
+    return str(_read_preset(preset).get(ABOUT, ""))
+
+
+def _read_preset(preset: str) -> dict[str, Any]:
+    if preset not in PRESETS:
+        raise InputError(f"preset {preset!r} is unknown; choose one of {', '.join(PRESETS)}")
+    file = importlib.resources.files("configs") / f"{preset}.yaml"
+    values: dict[str, Any] = yaml.safe_load(file.read_text()) or {}
+    return values
+
+
+def setting_names(schema: type[Any]) -> list[str]:
+    """Every dotted name that `--set` understands."""
+    return list(_walk_names(schema, ""))
+
+
+def _walk_names(schema: type[Any], prefix: str) -> Iterator[str]:
+    for name, annotation in _fields(schema).items():
+        yield prefix + name
+        for option in (annotation, *typing.get_args(annotation)):
+            if isinstance(option, type):
+                yield from _walk_names(option, f"{prefix}{name}.")
+
+
+def _fields(schema: type[Any]) -> dict[str, Any]:
+    """Names and types of a settings class; empty for a plain value."""
+    if issubclass(schema, BaseModel):
+        return {name: field.annotation for name, field in schema.model_fields.items()}
+    if dataclasses.is_dataclass(schema):
+        return typing.get_type_hints(schema)
+    return {}
+
+
+def _parse_override(override: str) -> tuple[str, Any]:
+    path, separator, text = override.partition("=")
+    if not separator or not path:
+        raise InputError(f"--set {override!r} is no setting; write it as stage.name=value")
+    try:
+        return path.strip(), yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise InputError(f"--set {override!r}: the value is no YAML; quote it") from error
+
+
+def _require_known(schema: type[RunConfig], path: str, *, origin: str) -> None:
+    names = setting_names(schema)
+    if path in names:
+        return
+    # A right name under the wrong stage is as likely as a misspelt one.
+    last = path.rpartition(".")[2]
+    same_name = [name for name in names if name.rpartition(".")[2] == last]
+    nearest = dict.fromkeys([*difflib.get_close_matches(path, names, NEAREST_NAMES), *same_name])
+    hint = (
+        f"did you mean {', '.join(list(nearest)[:NEAREST_NAMES])}?"
+        if nearest
+        else f"settings belong to {', '.join(schema.model_fields)}"
+    )
+    raise InputError(f"{origin} {path}: no such setting; {hint}")
+
+
+def _set(values: dict[str, Any], path: str, value: Any) -> None:
+    *parents, name = path.split(".")
+    for parent in parents:
+        below = values.setdefault(parent, {})
+        if not isinstance(below, dict):
+            raise InputError(f"--set {path}: {parent} was set to {below!r} before")
+        values = below
+    values[name] = value
+
+
+def _in_short(error: ValidationError, schema: type[RunConfig]) -> str:
+    """A validation error in one line, with suggestions for unknown names."""
+    problems = []
+    for problem in error.errors(include_url=False):
+        path = ".".join(str(part) for part in problem["loc"])
+        if problem["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+            _require_known(schema, path, origin="preset")
+        message = problem["msg"][0].lower() + problem["msg"][1:]
+        problems.append(f"{path}: {message}, got {problem['input']!r}")
+    return "; ".join(problems)
+
+
+def differences(config: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """Dotted names whose values differ, with both values; `...` where a side has no such name."""
+    one, two = dict(_flatten(config, "")), dict(_flatten(other, ""))
+    return [
+        (name, one.get(name, ...), two.get(name, ...))
+        for name in sorted({*one, *two})
+        if one.get(name, ...) != two.get(name, ...)
+    ]
+
+
+def _flatten(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value

@@ -1,0 +1,29 @@
+"""Settings of the export stage."""
+
+from typing import Literal
+
+from pydantic import Field, field_validator
+
+from stages.settings.base import StageConfig
+
+
+class ExportConfig(StageConfig):
+    """The finished files."""
+
+    formats: tuple[Literal["glb", "obj"], ...] = Field(
+        ("glb",), description="file formats; glb is always among them"
+    )
+    vertex_color_faces: int = Field(
+        100_000,
+        ge=100,
+        le=2_000_000,
+        description="decimate to this when phase 3 was skipped and vertices carry the colour",
+    )
+
+    @field_validator("formats")
+    @classmethod
+    def _has_glb(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
+        """The GLB is what a run is for; without it nothing could be checked."""
+        if "glb" not in formats:
+            raise ValueError('formats must contain "glb"')
+        return formats

@@ -1,0 +1,165 @@
+"""Phase 3: cleanup, decimation, atlas, and textures baked from the material field.
+
+Reads the surface of phase 2 (or phase 1's own when that was skipped) and the material field, writes
+a `TexturedMesh`. Every texel is projected back onto the original surface, where the field is asked
+and the normal is taken; so decimation costs neither colour nor relief. Method: SViM3D sec. 3.4;
+tangent frames: MikkTSpace; xatlas with a time limit, box projection beyond it.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.artifacts import FittedField, MaterialViews, RefinedSurface, TexturedMesh
+from stages.base import Context, Stage
+from stages.errors import InputError
+from stages.settings.uv_bake import UvBakeConfig
+from svim3d.mesh.atlas import unwrap
+from svim3d.mesh.cleanup import CleanMesh, clean_surface, decimate
+from svim3d.mesh.frames import bitangents, tangent_frames, tangent_from_world
+from svim3d.mesh.mesh import vertex_normals
+from svim3d.mesh.projection import project_onto
+from svim3d.mesh.texels import Texels, average_down, rasterize_uv, to_image
+from svim3d.numerics import normalize
+from svim3d.render.occlusion import ambient_occlusion
+
+POINTS_PER_CHUNK = 2**17  # bounds the memory of the field's intermediate values
+
+
+def run(
+    views: MaterialViews,
+    field: FittedField,
+    surface: RefinedSurface | None,
+    *,
+    config: UvBakeConfig,
+    ctx: Context,
+) -> TexturedMesh:
+    """Bake the field onto a mesh.
+
+    Raises:
+        InputError: there is no surface to bake.
+    """
+    fitted = surface if surface is not None else field.own_surface()
+    fine = clean_surface(
+        fitted.vertices,
+        fitted.faces,
+        min_area_share=config.min_area_share,
+        min_extent_share=config.min_extent_share,
+    )
+    if not len(fine.faces):
+        raise InputError(
+            f"wanted a surface to bake, got {len(fitted.faces)} faces of which none is sound; "
+            "run the earlier stages longer or check the masks of the views"
+        )
+    coarse = decimate(fine.vertices, fine.faces, max_faces=config.max_faces)
+    for note in (*fine.notes, *coarse.notes):
+        ctx.event("mesh", note)
+    ctx.report(1, 4, {"faces_fine": len(fine.faces), "faces": len(coarse.faces)})
+
+    mesh, texels = _unwrapped(coarse, config, ctx)
+    ctx.report(2, 4, {"vertices": len(mesh.vertices), "texels": len(texels.pixel)})
+
+    values = _bake(mesh, texels, fine, fitted, ctx.device)
+    ctx.report(3, 4, {})
+    openness = _openness(mesh, field, config.occlusion_rays)
+    values = torch.cat([values, texels.interpolate(mesh.faces, openness)], 1)
+    values, texels = average_down(values, texels, config.supersample)
+    image = to_image(values, texels)
+    ctx.report(4, 4, {"coverage": len(texels.pixel) / texels.size**2})
+    return TexturedMesh(
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+        normals=mesh.normals,
+        uv=mesh.uv,
+        tangents=mesh.tangents,
+        basecolor=image[..., :3].clamp(0.0, 1.0),
+        orm=image[..., [8, 3, 4]].clamp(0.0, 1.0),
+        normal_tangent=normalize(image[..., 5:8]),
+    )
+
+
+def _unwrapped(
+    coarse: CleanMesh, config: UvBakeConfig, ctx: Context
+) -> tuple[TexturedMesh, Texels]:
+    """The decimated mesh with normals, uv and tangents, textures still empty; and its texels."""
+    atlas = unwrap(
+        coarse.vertices,
+        coarse.faces,
+        texture_size=config.texture_size,
+        gutter_px=config.gutter_px,
+        timeout_s=config.atlas_timeout_s,
+    )
+    if atlas.fallback is not None:
+        ctx.event("atlas", f"charts by box projection: {atlas.fallback}")
+    ctx.report(1, 4, {"charts": atlas.charts})
+    smooth = vertex_normals(coarse.vertices, coarse.faces)
+    vertices, normals = (a[atlas.vertex_source.long()] for a in (coarse.vertices, smooth))
+    frames = tangent_frames(vertices, atlas.faces, normals, atlas.uv)
+    source = frames.vertex_source.long()
+    mesh = TexturedMesh(
+        vertices=vertices[source],
+        faces=frames.faces,
+        normals=normals[source],
+        uv=atlas.uv[source],
+        tangents=frames.tangents,
+        basecolor=vertices.new_zeros(0, 3),
+        orm=vertices.new_zeros(0, 3),
+        normal_tangent=None,
+    )
+    if config.supersample == 1:
+        return mesh, atlas.texels
+    return mesh, rasterize_uv(
+        atlas.uv[source], frames.faces, atlas.texels.size * config.supersample
+    )
+
+
+def _bake(
+    mesh: TexturedMesh,
+    texels: Texels,
+    fine: CleanMesh,
+    fitted: RefinedSurface,
+    device: torch.device,
+) -> Float[Tensor, "P 8"]:
+    """Basecolor (linear), roughness, metallic and tangent-space normal of every texel.
+
+    The shading normal is that of the field: geometric normal of the fine surface plus bump.
+    """
+    assert mesh.tangents is not None
+    normal, tangent, bitangent = (
+        texels.interpolate(mesh.faces, attribute)
+        for attribute in (
+            mesh.normals,
+            mesh.tangents[:, :3].contiguous(),
+            bitangents(mesh.normals, mesh.tangents),
+        )
+    )
+    points = texels.interpolate(mesh.faces, mesh.vertices)
+    hits = project_onto(points, normal, fine.vertices, fine.faces)
+    points = hits.interpolate(fine.faces, fine.vertices)
+    geometric = hits.interpolate(fine.faces, vertex_normals(fine.vertices, fine.faces))
+    materials = fitted.material_field(device)
+    chunks = []
+    with torch.no_grad():
+        for low in range(0, len(points), POINTS_PER_CHUNK):
+            part = slice(low, low + POINTS_PER_CHUNK)
+            found = materials(points[part].to(device))
+            shading = normalize(normalize(geometric[part]) + found.bump.cpu())
+            local = tangent_from_world(shading, normal[part], tangent[part], bitangent[part])
+            surface = torch.cat([found.basecolor, found.roughness, found.metallic], 1).cpu()
+            chunks.append(torch.cat([surface, local], 1))
+    return torch.cat(chunks)
+
+
+def _openness(mesh: TexturedMesh, field: FittedField, rays: int) -> Float[Tensor, "N 1"]:
+    """Share of the sky that each vertex sees; one everywhere without rays.
+
+    Per vertex suffices: occlusion varies slowly, and the vertices are a hundredth of the texels.
+    """
+    if rays == 0:
+        return torch.ones(len(mesh.vertices), 1)
+    return ambient_occlusion(
+        mesh.vertices, mesh.normals, field.sdf, half_extent=field.half_extent, rays=rays
+    )
+
+
+UV_BAKE = Stage(run)

@@ -1,0 +1,253 @@
+"""The mesh door: any common mesh file in, one self-contained glTF binary out.
+
+The writer is our own: a GLB is a JSON chunk and a buffer, and only so are the bytes a function of
+the content alone (no time stamps, no dictionary order of a library), tangents and normal maps are
+written as given, and the Khronos validator finds nothing to remark. Reading back is tested with
+other libraries.
+"""
+
+import io
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+from svim3d.color import linear_from_srgb
+from svim3d.io.gltf import BINARY_CHUNK, GLB_MAGIC, JSON_CHUNK, read_gltf
+from svim3d.io.image import encode_png
+from svim3d.io.obj import read_obj
+from svim3d.mesh.source_mesh import SourceMesh
+from svim3d.numerics import normalize
+
+GLTF_VERSION = 2
+ALIGNMENT = 4  # chunks and accessors start on multiples of their component size
+UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5123, 5125, 5126
+VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
+LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
+MAX_SHORT_VERTICES = 65535  # index 65535 itself restarts a primitive
+
+Json = dict[str, Any]
+
+
+def read_mesh(file: Path) -> SourceMesh:
+    """Read a .glb, .gltf or .obj file with its materials.
+
+    Raises:
+        ValueError: the file is missing, of another kind, damaged, or without triangles.
+    """
+    readers = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
+    if file.suffix.lower() not in readers:
+        raise ValueError(
+            f"{file.name} is no mesh that can be read; wanted one of {', '.join(readers)}"
+        )
+    if not file.is_file():
+        raise ValueError(f"there is no mesh file {file}")
+    mesh = readers[file.suffix.lower()](file)
+    if not all(bool(torch.isfinite(a).all()) for a in (mesh.vertices, mesh.normals, mesh.uv)):
+        raise ValueError(f"{file.name} holds NaN or infinite vertices; repair it before use")
+    return mesh
+
+
+def glb_bytes(
+    *,
+    vertices: Float[Tensor, "N 3"],
+    faces: Int[Tensor, "F 3"],
+    normals: Float[Tensor, "N 3"],
+    basecolor: Float[Tensor, "*texels 3"],
+    orm: Float[Tensor, "*texels 3"],
+    uv: Float[Tensor, "N 2"] | None = None,
+    tangents: Float[Tensor, "N 4"] | None = None,
+    normal_tangent: Float[Tensor, "T T 3"] | None = None,
+    name: str = "asset",
+) -> bytes:
+    """A GLB with one mesh and one metallic-roughness material; equal input gives equal bytes.
+
+    With `uv`, `basecolor` and `orm` are textures. Without, they are per vertex: the colour becomes
+    COLOR_0, and since glTF knows no roughness per vertex, the material takes the mean roughness and
+    metallic of all vertices.
+
+    Args:
+        vertices: positions.
+        faces: counter-clockwise seen from outside.
+        normals: unit.
+        basecolor: linear in [0, 1]; a texture is stored with the sRGB curve, 8 bit.
+        orm: occlusion, roughness, metallic in [0, 1]; a texture is stored as it is, 8 bit.
+        uv: glTF texture coordinates, origin at the top left.
+        tangents: MikkTSpace tangent and handedness.
+        normal_tangent: unit, green up; needs `tangents`.
+        name: of the node, mesh and material.
+    """
+    if (normal_tangent is None) != (tangents is None) or (tangents is not None and uv is None):
+        raise ValueError("a normal map, tangents and uv go together: give all or neither")
+    parts = _Parts()
+    attributes = {
+        "POSITION": parts.floats(vertices, bounds=True),
+        "NORMAL": parts.floats(normalize(normals)),
+    }
+    if tangents is not None:
+        attributes["TANGENT"] = parts.floats(
+            torch.cat([normalize(tangents[:, :3]), tangents[:, 3:]], 1)
+        )
+    shading: Json = {}
+    material: Json = {"name": name, "pbrMetallicRoughness": shading}
+    if uv is None:
+        attributes["COLOR_0"] = parts.floats(basecolor.clamp(0.0, 1.0))
+        roughness, metallic = orm[:, 1:].mean(0).clamp(0.0, 1.0).tolist()
+        shading |= {"roughnessFactor": roughness, "metallicFactor": metallic}
+    else:
+        attributes["TEXCOORD_0"] = parts.floats(uv)
+        shading["baseColorTexture"] = parts.texture("basecolor", encode_png(basecolor, srgb=True))
+        shading["metallicRoughnessTexture"] = parts.texture("orm", encode_png(orm))
+        if bool((orm[..., 0] < 1.0).any()):
+            material["occlusionTexture"] = dict(shading["metallicRoughnessTexture"])
+        if normal_tangent is not None:
+            encoded = encode_png(normal_tangent * 0.5 + 0.5)
+            material["normalTexture"] = parts.texture("normal", encoded)
+    primitive = {
+        "attributes": attributes,
+        "indices": parts.indices(faces, len(vertices)),
+        "material": 0,
+    }
+    return parts.pack(
+        {
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"name": name, "mesh": 0}],
+            "meshes": [{"name": name, "primitives": [primitive]}],
+            "materials": [material],
+        }
+    )
+
+
+@dataclass(frozen=True)
+class ReopenedGlb:
+    """What another reader (trimesh) makes of a GLB, in the terms of `glb_bytes`.
+
+    Attributes:
+        vertices: positions.
+        faces: vertex indices.
+        uv: glTF texture coordinates, or None.
+        basecolor: linear; texture or per vertex.
+        orm: texture, or None where the material has factors.
+        normal_tangent: texture, or None.
+    """
+
+    vertices: Float[Tensor, "N 3"]
+    faces: Int[Tensor, "F 3"]
+    uv: Float[Tensor, "N 2"] | None
+    basecolor: Float[Tensor, "*texels 3"]
+    orm: Float[Tensor, "T T 3"] | None
+    normal_tangent: Float[Tensor, "T T 3"] | None
+
+
+def reopen_glb(content: bytes) -> ReopenedGlb:
+    """Read a GLB of one mesh with trimesh, to check what was written."""
+    scene = trimesh.load(io.BytesIO(content), file_type="glb", process=False, force="scene")
+    (mesh,) = scene.geometry.values()
+    material = getattr(mesh.visual, "material", None)
+
+    def texture(name: str) -> Tensor | None:
+        picture = getattr(material, name, None)
+        if picture is None:
+            return None
+        return torch.from_numpy(np.asarray(picture.convert("RGB"), np.float32) / 255.0)
+
+    basecolor, normal = texture("baseColorTexture"), texture("normalTexture")
+    if basecolor is None:
+        colors = mesh.visual.vertex_attributes["color"]  # COLOR_0, linear as stored
+        painted = torch.from_numpy(np.array(colors, np.float32))
+    else:
+        painted = linear_from_srgb(basecolor)
+    uv = getattr(mesh.visual, "uv", None)
+    # trimesh turns v upwards.
+    upright = None if uv is None else np.asarray(uv, np.float64) * [1.0, -1.0] + [0.0, 1.0]
+    return ReopenedGlb(
+        vertices=torch.from_numpy(np.asarray(mesh.vertices, np.float32)),
+        faces=torch.from_numpy(np.asarray(mesh.faces, np.int64)),
+        uv=None if upright is None else torch.from_numpy(upright.astype(np.float32)),
+        basecolor=painted,
+        orm=texture("metallicRoughnessTexture"),
+        normal_tangent=None if normal is None else normal * 2.0 - 1.0,
+    )
+
+
+class _Parts:
+    """Collects what the document refers to by index."""
+
+    def __init__(self) -> None:
+        self._content = bytearray()
+        self._lists: dict[str, list[Json]] = {
+            "accessors": [],
+            "bufferViews": [],
+            "images": [],
+            "textures": [],
+            "samplers": [],
+        }
+
+    def _append(self, kind: str, entry: Json) -> int:
+        self._lists[kind].append(entry)
+        return len(self._lists[kind]) - 1
+
+    def _view(self, content: bytes, target: int | None = None) -> int:
+        """Add aligned bytes to the buffer."""
+        self._content += b"\0" * (-len(self._content) % ALIGNMENT)
+        entry: Json = {"buffer": 0, "byteOffset": len(self._content), "byteLength": len(content)}
+        self._content += content
+        return self._append("bufferViews", entry | ({} if target is None else {"target": target}))
+
+    def floats(self, values: Tensor, *, bounds: bool = False) -> int:
+        """A vertex attribute; `bounds` adds the extent that glTF wants of positions."""
+        array: NDArray[np.float32] = values.detach().cpu().float().numpy()
+        entry: Json = {
+            "bufferView": self._view(array.astype("<f4").tobytes(), VERTEX_BUFFER),
+            "componentType": FLOAT,
+            "count": len(array),
+            "type": f"VEC{array.shape[1]}",
+        }
+        if bounds:
+            entry |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
+        return self._append("accessors", entry)
+
+    def indices(self, faces: Tensor, vertices: int) -> int:
+        """Triangle indices in the smallest type that holds them."""
+        short = vertices <= MAX_SHORT_VERTICES
+        array = faces.detach().cpu().numpy().reshape(-1).astype("<u2" if short else "<u4")
+        return self._append(
+            "accessors",
+            {
+                "bufferView": self._view(array.tobytes(), INDEX_BUFFER),
+                "componentType": UNSIGNED_SHORT if short else UNSIGNED_INT,
+                "count": len(array),
+                "type": "SCALAR",
+            },
+        )
+
+    def texture(self, name: str, png: bytes) -> Json:
+        """A reference to an embedded PNG, trilinear, clamped at the border."""
+        if not self._lists["samplers"]:
+            sampler: Json = {"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP_LINEAR}
+            self._append("samplers", sampler | {"wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE})
+        image = self._append(
+            "images", {"name": name, "mimeType": "image/png", "bufferView": self._view(png)}
+        )
+        return {"index": self._append("textures", {"sampler": 0, "source": image})}
+
+    def pack(self, document: Json) -> bytes:
+        """The finished file."""
+        full: Json = {"asset": {"version": "2.0", "generator": "svim3d"}} | document
+        full |= {kind: entries for kind, entries in self._lists.items() if entries}
+        binary = bytes(self._content) + b"\0" * (-len(self._content) % ALIGNMENT)
+        full["buffers"] = [{"byteLength": len(binary)}]
+        text = json.dumps(full, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % ALIGNMENT)
+        body = struct.pack("<I", len(text)) + JSON_CHUNK + text
+        body += struct.pack("<I", len(binary)) + BINARY_CHUNK + binary
+        return GLB_MAGIC + struct.pack("<II", GLTF_VERSION, 12 + len(body)) + body
