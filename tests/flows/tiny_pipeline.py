@@ -1,6 +1,6 @@
 """Three tiny stages wired like the real ones: an input, a long skippable stage, a final one."""
 
-from tiny_stages.walk import WalkConfig
+from tiny_settings import WalkConfig
 
 from flows.config import RunConfig
 from flows.pipeline import SOURCE, Node, Pipeline, Product

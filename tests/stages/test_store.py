@@ -182,7 +182,7 @@ def test_disk_that_fills_up_during_the_work_is_a_passing_fault(store, fault):
         (work / "checkpoint").write_bytes(b"step 7")
         raise fault
 
-    with pytest.raises(TransientError, match="no space left .* finished work is kept"):
+    with pytest.raises(TransientError, match=r"no space left .* finished work is kept"):
         store.obtain(recipe(), fill)
     assert (store.work(recipe().key) / "checkpoint").exists()
     assert not store.obtain(recipe(), Stage()).is_cached
@@ -194,12 +194,11 @@ def test_read_only_store_gives_what_it_has_and_refuses_the_rest(store, monkeypat
     def refuse(path, *_, **__):
         raise OSError(errno.EROFS, "Read-only file system", str(path))
 
-    for name in ("mkdir", "rename", "replace", "open", "touch"):
-        if name != "open":
-            monkeypatch.setattr(Path, name, refuse)
+    for name in ("mkdir", "rename", "replace"):
+        monkeypatch.setattr(Path, name, refuse)
     monkeypatch.setattr(store_module.shutil, "rmtree", refuse)
     assert store.obtain(recipe(), Stage()).is_cached
-    with pytest.raises(InputError, match="cannot be written .*choose another --store"):
+    with pytest.raises(InputError, match=r"cannot be written .*choose another --store"):
         store.obtain(recipe(radius=9), Stage())
 
 

@@ -3,14 +3,13 @@
 import errno
 import time
 from pathlib import Path
-from typing import Literal
 
 import torch
+from tiny_settings import WalkConfig
 from tiny_stages.numbers import Numbers
 
 from stages.base import Context, Stage
 from stages.errors import InputError, TransientError
-from stages.settings.base import StageConfig
 
 FAULTS = {
     "transient": TransientError("a lock was held"),
@@ -22,25 +21,16 @@ FAULTS = {
 }
 
 
-class WalkConfig(StageConfig):
-    """How far to walk, and what goes wrong."""
-
-    steps: int = 40
-    pause_s: float = 0.0
-    fault: Literal["", "transient", "memory", "cuda memory", "io", "input", "defect"] = ""
-    faults: int = 1
-
-
 def run(numbers: Numbers, *, config: WalkConfig, ctx: Context) -> Numbers:
     """Add noise `steps` times; the state is the numbers and the generator."""
     _fail(config, ctx.work / "attempts")
     generator = ctx.generator("noise")
-    step, values = 0, numbers.values
+    first, values = 0, numbers.values
     if (saved := ctx.checkpoints.load()) is not None:
-        step, state = saved
+        first, state = saved
         values = state["values"]
         generator.set_state(state["generator"])
-    for step in range(step, config.steps):
+    for step in range(first, config.steps):
         if step % 5 == 0:
             ctx.checkpoints.save(step, {"values": values, "generator": generator.get_state()})
         values = values + torch.randn(values.shape, generator=generator)
