@@ -19,11 +19,8 @@ from svim3d.io.exr import read_rgb, write_rgb
 from svim3d.io.image import read_png, write_png
 from svim3d.io.orbit import read_orbit, write_orbit
 from svim3d.io.weights import load_tensors, save_tensors
-<<<<<<< HEAD
-from svim3d.numerics import normalize
-=======
 from svim3d.mesh.marching import extract_surface
->>>>>>> field
+from svim3d.numerics import normalize
 from svim3d.shading.environment import latlong_from_octahedral
 
 
@@ -337,10 +334,7 @@ class ExportedAsset:
             },
             summary=json.loads((folder / "summary.json").read_text()),
         )
-<<<<<<< HEAD
-=======
 
     def headline(self) -> str:
         """Size of the GLB."""
         return f"asset.glb of {len(self.files['asset.glb']) / 2**20:.2f} MiB"
->>>>>>> field
