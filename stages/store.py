@@ -41,21 +41,6 @@ Compute = Callable[[Path, Path], Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
-class Health:
-    """State of a key in the store.
-
-    Attributes:
-        state: "ok", "missing" or "corrupted".
-        damage: what is wrong with a corrupted artifact.
-        manifest: of a sound artifact.
-    """
-
-    state: Literal["ok", "missing", "corrupted"]
-    damage: str = ""
-    manifest: Manifest | None = None
-
-
-@dataclass(frozen=True)
 class Stored:
     """A sound artifact in the store.
 
@@ -73,6 +58,21 @@ class Stored:
     def key(self) -> str:
         """Content address."""
         return self.manifest.recipe.key
+
+
+@dataclass(frozen=True)
+class Health:
+    """State of a key in the store.
+
+    Attributes:
+        state: "ok", "missing" or "corrupted".
+        damage: what is wrong with a corrupted artifact.
+        stored: the artifact, if it is sound.
+    """
+
+    state: Literal["ok", "missing", "corrupted"]
+    damage: str = ""
+    stored: Stored | None = None
 
 
 class Store:
@@ -115,7 +115,7 @@ class Store:
         if damage := manifest.damage(folder, hashes=key not in self._verified):
             return Health("corrupted", damage)
         self._verified.add(key)
-        return Health("ok", manifest=manifest)
+        return Health("ok", stored=Stored(folder / FILES_FOLDER, manifest, is_cached=True))
 
     def recent(self, limit: int) -> Iterator[Manifest]:
         """Readable manifests of the latest published artifacts, newest first."""
@@ -141,21 +141,16 @@ class Store:
             TransientError: the disk is full, or another process holds the key for too long.
             InputError: the store cannot be written.
         """
-        if not force and not self.work(recipe.key).exists() and (found := self._find(recipe.key)):
+        key = recipe.key
+        if not force and not self.work(key).exists() and (found := self.check(key).stored):
             return found
-        with self._explained(), self._locked(recipe.key):
+        with self._explained(), self._locked(key):
             # Another process may have published while this one waited, and one that was killed
             # right after its rename leaves its checkpoints behind.
-            if not force and (found := self._find(recipe.key)):
-                shutil.rmtree(self.work(recipe.key), ignore_errors=True)
+            if not force and (found := self.check(key).stored):
+                shutil.rmtree(self.work(key), ignore_errors=True)
                 return found
             return self._compute(recipe, compute)
-
-    def _find(self, key: str) -> Stored | None:
-        health = self.check(key)
-        if health.manifest is None:
-            return None
-        return Stored(self.artifact(key) / FILES_FOLDER, health.manifest, is_cached=True)
 
     def _compute(self, recipe: Recipe, compute: Compute) -> Stored:
         key, work = recipe.key, self.work(recipe.key)

@@ -1,7 +1,101 @@
-"""Settings of the nerf stage."""
+"""Settings of phase 1."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from stages.settings.base import StageConfig
 
+GridNodes = Annotated[int, Field(ge=16, le=512)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
 
 class NerfConfig(StageConfig):
-    """Phase 1, the field."""
+    """Phase 1: fit a surface, its materials and its light to the views."""
+
+    steps: PositiveInt = 1200
+    """Optimiser steps. The paper takes 800 at full image size."""
+    rays_per_step: Annotated[int, Field(ge=64, multiple_of=4)] = 4096
+    """Rays of a step, drawn as blocks of 2 x 2 pixels over all views."""
+    image_size: PositiveInt = 256
+    """Longest side that larger views are averaged down to, pixels."""
+    density_model: Literal["sdf", "density"] = "sdf"
+    """`sdf`: signed-distance grid started at the visual hull (NeuS); `density`: Instant-NGP."""
+
+    half_extent: PositiveFloat = 0.55
+    """Half the side of the cube that holds the object, world units."""
+    hull_rejections: Annotated[int, Field(ge=0, le=7)] = 0
+    """Masks that may exclude a point of the object by mistake; 1 to 2 for generated views."""
+    grid_nodes: tuple[GridNodes, ...] = (64, 96, 128, 192)
+    """Nodes per side of the signed-distance grid, coarse to fine; the last is what is returned."""
+    grid_shares: tuple[Share, ...] = (0.0, 0.25, 0.5, 0.7)
+    """Share of the steps at which each grid begins."""
+    sharpness_start: PositiveFloat = 80.0
+    """Inverse width of the opacity transition at the start, per world unit (NeuS: s)."""
+    density_threshold: PositiveFloat = 50.0
+    """Density of the surface, per world unit (density model only)."""
+
+    hash_levels: Annotated[int, Field(ge=1, le=16)] = 8
+    """Lattices of the material field's hash grid."""
+    hash_log2_entries: Annotated[int, Field(ge=8, le=22)] = 17
+    """A level stores at most 2^this nodes."""
+    hash_finest: PositiveInt = 384
+    """Cells per side of the finest lattice; about one per pixel of the object."""
+    hidden: PositiveInt = 32
+    """Width of the material network."""
+    bump_start: Share = 0.5
+    """Share of the steps after which the bump normal is fitted (paper: one half)."""
+
+    environment_size: Annotated[int, Field(ge=16, multiple_of=16)] = 64
+    """Side of the octahedral map when phase 0 was skipped, texels."""
+    environment_start: PositiveFloat = 0.5
+    """Radiance of the flat light when phase 0 was skipped."""
+    multiple_scattering: bool = True
+    """Give back the energy that rough metals lose to single scattering (Fdez-Aguera 2019)."""
+
+    field_rate: PositiveFloat = 1e-2
+    """Adam step of hash grid and transition sharpness; Source: Mueller et al. 2022."""
+    network_rate: PositiveFloat = 5e-3
+    """Adam step of the networks."""
+    sdf_rate: PositiveFloat = 0.06
+    """Adam step of the signed distance, in cells of the current grid."""
+    environment_rate: NonNegativeFloat = 5e-3
+    """Adam step of the log radiance; 0 keeps the light as it came."""
+    final_rate: Share = 0.05
+    """All rates decay exponentially to this share."""
+
+    mask_weight: NonNegativeFloat = 0.3
+    """Cross-entropy of coverage."""
+    basecolor_weight: NonNegativeFloat = 1.0
+    """Absolute difference in sRGB."""
+    orm_weight: NonNegativeFloat = 0.5
+    """Absolute difference of roughness and metallic."""
+    normal_weight: NonNegativeFloat = 1.0
+    """Absolute difference of geometric normals at the start."""
+    normal_weight_end: NonNegativeFloat = 0.3
+    """The same at the end: normals lead at first, as in the paper."""
+    bump_normal_weight: NonNegativeFloat = 0.5
+    """Absolute difference of shading normals, once the bump is fitted."""
+    radiance_weight: NonNegativeFloat = 0.5
+    """Squared difference of tone-mapped radiance."""
+    eikonal_weight: NonNegativeFloat = 0.05
+    """Unit gradient of the signed distance."""
+    normal_smoothness_weight: NonNegativeFloat = 0.02
+    """Bilateral smoothness of geometric normals."""
+    depth_smoothness_weight: NonNegativeFloat = 0.005
+    """RegNeRF smoothness of depth."""
+    bump_size_weight: NonNegativeFloat = 0.01
+    """Squared length of the bump, so that it holds only what geometry cannot."""
+    light_balance_weight: NonNegativeFloat = 0.005
+    """Distance of the light's colour from grey; Source: nvdiffrec."""
+
+    @model_validator(mode="after")
+    def _schedule_is_ordered(self) -> Self:
+        if len(self.grid_nodes) != len(self.grid_shares):
+            raise ValueError(
+                f"grid_nodes and grid_shares pair up, got {len(self.grid_nodes)} and "
+                f"{len(self.grid_shares)} entries"
+            )
+        if list(self.grid_shares) != sorted(self.grid_shares) or self.grid_shares[0] != 0.0:
+            raise ValueError(f"grid_shares must rise from 0, got {self.grid_shares}")
+        return self

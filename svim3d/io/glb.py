@@ -24,7 +24,7 @@ from svim3d.color import linear_from_srgb
 from svim3d.io.gltf import BINARY_CHUNK, GLB_MAGIC, JSON_CHUNK, read_gltf
 from svim3d.io.image import encode_png
 from svim3d.io.obj import read_obj
-from svim3d.io.source_mesh import SourceMesh
+from svim3d.mesh.source_mesh import SourceMesh
 from svim3d.numerics import normalize
 
 GLTF_VERSION = 2

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from svim3d.color import linear_from_srgb
 from svim3d.io.image import decode_image
-from svim3d.io.source_mesh import SourceMaterial, SourceMesh, complete, merge
+from svim3d.mesh.source_mesh import SourceMaterial, SourceMesh, complete, merge
 from svim3d.numerics import normalize
 
 Json = dict[str, Any]

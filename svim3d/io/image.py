@@ -1,14 +1,15 @@
 """The Pillow door: 8-bit pictures in and out, 16-bit grey in."""
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageDraw, ImageFont, UnidentifiedImageError
 from torch import Tensor
 
 from svim3d.color import linear_from_srgb, srgb_from_linear
@@ -96,3 +97,26 @@ def read_png(file: Path, *, srgb: bool = False) -> Float[Tensor, "H W C"]:
 def write_png(file: Path, image: Float[Tensor, "H W C"], *, srgb: bool = False) -> None:
     """Write an 8-bit PNG as `encode_png` does; replaced if it exists."""
     file.write_bytes(encode_png(image, srgb=srgb))
+
+
+@dataclass(frozen=True)
+class Label:
+    """A line of text on a picture; (x, y) is the left end of its middle line, pixels."""
+
+    x: int
+    y: int
+    text: str
+    size_px: int
+
+
+def with_labels(
+    image: Float[Tensor, "H W 3"], labels: Sequence[Label], *, ink: float
+) -> Float[Tensor, "H W 3"]:
+    """A display-encoded picture with text of grey value `ink` on it, rounded to 8 bit."""
+    picture = Image.open(io.BytesIO(encode_png(image)))
+    draw = ImageDraw.Draw(picture)
+    grey = (round(ink * MAX_8BIT),) * 3
+    for label in labels:
+        font = ImageFont.load_default(label.size_px)
+        draw.text((label.x, label.y), label.text, fill=grey, font=font, anchor="lm")
+    return torch.from_numpy(_plain_array(picture))

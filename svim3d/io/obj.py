@@ -11,7 +11,7 @@ from torch import Tensor
 
 from svim3d.color import linear_from_srgb, srgb_from_linear
 from svim3d.io.image import decode_image, encode_png
-from svim3d.io.source_mesh import SourceMaterial, SourceMesh, complete, merge
+from svim3d.mesh.source_mesh import SourceMaterial, SourceMesh, complete, merge
 from svim3d.numerics import normalize
 
 DEFAULT_ROUGHNESS = 0.5  # of a material that gives neither Pr nor Ns

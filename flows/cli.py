@@ -1,0 +1,170 @@
+"""The `svim3d` command: parse, then call what does the work.
+
+Nothing heavy is imported before the command is known: `--help` answers at once, and a run that the
+store can answer never loads torch or Prefect.
+"""
+
+import argparse
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+
+from flows.pipeline import IMAGE_TO_ASSET
+
+DONE, FAILED, BAD_INPUT, CANCELLED = 0, 1, 2, 130
+DEFAULT_STORE = Path(".svim3d")
+STAGES = ", ".join(IMAGE_TO_ASSET.names)
+
+# Thread pools that spin while they wait starve each other: two of them on two cores made the
+# slowest tenth of 23 ms steps six times as long. Must be set before torch is imported.
+THREADING = {"GOMP_SPINCOUNT": "0", "KMP_BLOCKTIME": "0"}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    for name, value in THREADING.items():
+        os.environ.setdefault(name, value)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.command is None:
+        parser.print_help()
+        return BAD_INPUT
+    try:
+        return _dispatch(options)
+    except KeyboardInterrupt:
+        print("cancelled; the same command goes on where this one stopped", file=sys.stderr)
+        return CANCELLED
+    except Exception as error:
+        from stages.errors import InputError
+
+        if options.debug:
+            traceback.print_exc()
+        print(f"svim3d: {error or type(error).__name__}", file=sys.stderr)
+        if isinstance(error, InputError):
+            return BAD_INPUT
+        if not options.debug:
+            print("svim3d: run again with --debug for the whole traceback", file=sys.stderr)
+        return FAILED
+
+
+def _dispatch(options: argparse.Namespace) -> int:
+    if options.command == "doctor":
+        from flows.doctor import doctor
+
+        return doctor(options.store)
+    from flows import commands
+
+    if options.command == "presets":
+        return commands.show_presets()
+    request = commands.Request(
+        source=options.input,
+        out=options.output,
+        preset=options.preset,
+        overrides=tuple(options.set),
+        skip=frozenset(options.skip),
+        start=options.start,
+        until=options.until,
+        only=options.only,
+        force=frozenset(options.force),
+        seed=options.seed,
+        device=options.device,
+        store=options.store,
+    )
+    return commands.show_plan(request) if options.command == "plan" else commands.run(request)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="svim3d", description="Views of an object in, a relightable 3D asset out."
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    shared = argparse.ArgumentParser(add_help=False)
+    shared.add_argument("--debug", action="store_true", help="show whole tracebacks")
+    shared.add_argument(
+        "--store",
+        type=Path,
+        default=DEFAULT_STORE,
+        metavar="DIR",
+        help="where artifacts are kept (%(default)s)",
+    )
+    job = _job_options()
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    for name, parents, purpose in (
+        ("run", [job, shared], "make the asset; finished stages are taken from the store"),
+        ("plan", [job, shared], "say which stages a run would compute, and why"),
+        ("presets", [shared], "list the presets: their steps and what they leave out"),
+        ("doctor", [shared], "describe this machine, the installation and the store"),
+    ):
+        commands.add_parser(
+            name, parents=parents, help=purpose, description=purpose[0].upper() + purpose[1:] + "."
+        )
+    return parser
+
+
+def _job_options() -> argparse.ArgumentParser:
+    """Options that say what to make, shared by `run` and `plan`."""
+    job = argparse.ArgumentParser(add_help=False, epilog=f"Stages: {STAGES}.")
+    job.add_argument(
+        "input",
+        nargs="?",
+        default="example",
+        metavar="INPUT",
+        help="an orbit folder, a .glb, .gltf or .obj file, or the word 'example' (the default)",
+    )
+    job.add_argument(
+        "-o", "--output", type=Path, metavar="OUT", help="run folder (out/<name of the input>)"
+    )
+    job.add_argument(
+        "--preset", default="standard", help="preview, standard or paper (%(default)s)"
+    )
+    job.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="STAGE.NAME=VALUE",
+        help="change one setting; may be repeated",
+    )
+    for option, target, purpose in (
+        ("--from", "start", "recompute this stage and all after it"),
+        ("--until", "until", "stop after this stage"),
+        ("--only", "only", "this stage alone; what it needs must be in the store"),
+    ):
+        job.add_argument(option, dest=target, metavar="STAGE", help=purpose)
+    job.add_argument(
+        "--skip",
+        action="append",
+        default=[],
+        metavar="STAGE",
+        help=f"leave a stage out ({', '.join(IMAGE_TO_ASSET.skippable)}); may be repeated",
+    )
+    job.add_argument(
+        "--force",
+        action="append",
+        default=[],
+        metavar="STAGE",
+        help="recompute a stage though nothing changed; may be repeated",
+    )
+    job.add_argument("--seed", type=int, default=0, help="of all random numbers (%(default)s)")
+    job.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="(%(default)s)"
+    )
+    return job
+
+
+class _Version(argparse.Action):
+    """Prints the installed version; metadata is read only when it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            print(f"svim3d {version('svim3d')}")
+        except PackageNotFoundError:
+            print("svim3d (not installed: running from a checkout)")
+        parser.exit()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,361 @@
+"""Phase 1: fit a surface, its materials and its light to the views.
+
+Reads MaterialViews and, unless phase 0 was skipped, an EnvironmentLight; writes a FittedField.
+Method: the visual hull of the masks starts a volume (signed distance or density); a hash-grid
+field holds the materials; rays are composited and shaded once each by the prefiltered environment
+and compared with the views' radiance, materials, normals and masks. Depth is never used.
+Source: SViM3D sec. 4 (phase 1 of the reconstruction), on top of Instant-NGP and NeuS.
+"""
+
+import logging
+from dataclasses import dataclass
+
+import torch
+from svim3d.shading.prefilter import PyramidOperator
+from torch import Tensor, nn
+
+from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
+from stages.base import Context, Stage
+from stages.errors import InputError
+from stages.settings.nerf import NerfConfig
+from svim3d.cameras import Cameras
+from svim3d.fields.distance import signed_distance, without_hidden_parts
+from svim3d.fields.hash_grid import HashGridSpec
+from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
+from svim3d.fields.sdf_grid import resample_grid
+from svim3d.numerics import normalize
+from svim3d.optim import NamedAdam, Rate
+from svim3d.render import ray_losses
+from svim3d.render.hull import INSIDE_COVERAGE, coverage_votes
+from svim3d.render.march import hits_surface
+from svim3d.render.pixel_blocks import PIXELS, PixelBlocks
+from svim3d.render.volumes import DensityVolume, SdfVolume
+from svim3d.render.volumetric import Rendered, render_rays
+
+SDF, ENVIRONMENT = "volume.grid", "log_environment"  # names of parameters
+
+log = logging.getLogger(__name__)
+
+MIN_COVERAGE = 1e-3  # guards the division that turns premultiplied into straight
+MIN_VIEWS = 3  # fewer silhouettes leave the hull open along whole directions
+ENVIRONMENT_EPS = 1e-8  # texels that nothing reflects keep the light they started with
+HULL_NODES = 128  # fine enough for parts of one pixel, and still computed in half a second
+MIN_RADIANCE = 1e-4  # keeps the logarithm of black texels finite
+SMALLEST_PART = 1e-4  # of the largest part's volume: smaller ones are specks
+REFRESH_EVERY = 8  # steps between updates of the empty-space grid
+WARM_UP = 10  # steps over which the rates rise, while Adam's moments fill
+CULL_RAYS = 65536  # rays tested at once for meeting the hull
+MIN_HULL_NODES = 8  # a hull of fewer nodes is noise
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Everything that the optimisation changes."""
+
+    volume: SdfVolume | DensityVolume
+    materials: MaterialField
+    log_environment: nn.Parameter
+    adam: NamedAdam
+
+    @classmethod
+    def assemble(
+        cls,
+        volume: SdfVolume | DensityVolume,
+        materials: MaterialField,
+        log_environment: nn.Parameter,
+        config: NerfConfig,
+    ) -> "_Fit":
+        """Give every parameter its rate."""
+        named = {f"volume.{n}": p for n, p in volume.named_parameters()}
+        named |= {f"materials.{n}": p for n, p in materials.named_parameters()}
+        named[ENVIRONMENT] = log_environment
+        rates = {name: _rate(name, config) for name in named}
+        if isinstance(volume, SdfVolume):
+            rates[SDF] = Rate(config.sdf_rate * volume.cell)
+        return cls(volume, materials, log_environment, NamedAdam(named, rates))
+
+    def grow(self, nodes: int, config: NerfConfig) -> None:
+        """Refine the signed-distance grid and carry Adam's moments along.
+
+        A node of a finer grid sees fewer samples: its gradients shrink with the cell's volume.
+        """
+        assert isinstance(self.volume, SdfVolume)
+        ratio = (len(self.volume.grid) / nodes) ** 3
+        self.volume.resample(nodes)
+        self.adam.replace(
+            SDF,
+            self.volume.grid,
+            Rate(config.sdf_rate * self.volume.cell),
+            lambda moment, old: (
+                resample_grid(old, nodes) * (ratio if moment == "exp_avg" else ratio**2)
+            ),
+        )
+
+
+def _rate(name: str, config: NerfConfig) -> Rate:
+    """Adam's step by kind of parameter."""
+    if name == ENVIRONMENT:
+        return Rate(config.environment_rate, eps=ENVIRONMENT_EPS)
+    return Rate(config.network_rate if ".network." in name else config.field_rate)
+
+
+def _image_planes(views: MaterialViews, size: int, device: torch.device) -> dict[str, Tensor]:
+    """The views' images, premultiplied by the mask and averaged down to at most `size`."""
+    mask = views.mask
+    planes = {
+        "mask": mask,
+        "radiance": views.radiance,
+        "basecolor": views.basecolor * mask,
+        "roughness": views.roughness * mask,
+        "metallic": views.metallic * mask,
+        "normal": normalize(views.normal_world) * mask,
+    }
+    factor = -(-max(mask.shape[1:3]) // size)
+    return {name: _average(plane, factor).to(device) for name, plane in planes.items()}
+
+
+def _average(images: Tensor, factor: int) -> Tensor:
+    """Mean over factor x factor pixels; rows and columns that do not fill one are cut."""
+    if factor == 1:
+        return images
+    pooled = torch.nn.functional.avg_pool2d(images.permute(0, 3, 1, 2), factor)
+    return pooled.permute(0, 2, 3, 1).contiguous()
+
+
+def _check(views: MaterialViews) -> None:
+    """Refuse what can never work, with advice."""
+    if len(views.cameras) < MIN_VIEWS:
+        raise InputError(
+            f"nerf needs at least {MIN_VIEWS} views around the object, got {len(views.cameras)}; "
+            "give an orbit of views (21 are usual), or a mesh to render one from"
+        )
+    empty = [i for i, mask in enumerate(views.mask) if float(mask.max()) < INSIDE_COVERAGE]
+    if empty:
+        raise InputError(
+            f"the mask of view {empty[0]} is empty (as are {len(empty) - 1} others); every view "
+            "must show the object: check channel A of these views or leave them out"
+        )
+
+
+def _hull(masks: Tensor, cameras: Cameras, config: NerfConfig, ctx: Context) -> Tensor:
+    """Signed distance of the visual hull, positive inside.
+
+    If the masks disagree so much that nothing is left, more of them may be wrong.
+    """
+    matrices = cameras.clip_from_world()
+    allowed = min(config.hull_rejections + 2, 7, len(cameras) - 2)
+    for rejections in range(min(config.hull_rejections, allowed), allowed + 1):
+        votes = coverage_votes(
+            masks[..., 0],
+            matrices,
+            nodes=HULL_NODES,
+            half_extent=config.half_extent,
+            rejections=rejections,
+        )
+        inside = votes >= INSIDE_COVERAGE
+        if int(inside.sum()) >= MIN_HULL_NODES:
+            if rejections > config.hull_rejections:
+                ctx.event("inconsistent_masks", f"hull found with {rejections} masks rejected")
+            return signed_distance(inside, config.half_extent)
+    raise InputError(
+        f"no point of the cube of half side {config.half_extent} lies in all masks but "
+        f"{allowed}: the views contradict each other or their cameras are wrong; check that the "
+        "object is centred at the origin with longest side 1 and that poses are OpenGL c2w"
+    )
+
+
+def _pixel_blocks(
+    cameras: Cameras, planes: dict[str, Tensor], hull: Tensor, config: NerfConfig
+) -> PixelBlocks:
+    """Blocks of which some ray comes near the hull; all others show nothing and teach nothing."""
+    blocks = PixelBlocks.cut(cameras, planes)
+    volume = SdfVolume(hull, config.half_extent, config.sharpness_start)
+    keep = []
+    for start in range(0, len(blocks), CULL_RAYS // PIXELS):
+        part = blocks.take(torch.arange(start, min(start + CULL_RAYS // PIXELS, len(blocks))))
+        hits = hits_surface(
+            part.rays(), volume.cells, half_extent=config.half_extent, step=volume.step
+        )
+        keep.append(hits.view(-1, PIXELS).any(1))
+    return blocks.take(torch.cat(keep))
+
+
+def _start(
+    hull: Tensor, environment: EnvironmentLight | None, config: NerfConfig, ctx: Context
+) -> _Fit:
+    """Parameters and optimiser before the first step."""
+    if config.density_model == "sdf":
+        volume: SdfVolume | DensityVolume = SdfVolume(
+            hull, config.half_extent, config.sharpness_start
+        )
+        volume.resample(config.grid_nodes[0])
+    else:
+        volume = DensityVolume(
+            HashGridSpec(config.hash_levels, config.hash_log2_entries, 16, config.hash_finest),
+            hull,
+            config.half_extent,
+            config.density_threshold,
+        )
+        volume.reset(ctx.generator("density"))
+    spec = MaterialFieldSpec(
+        levels=config.hash_levels,
+        log2_entries=config.hash_log2_entries,
+        coarsest=16,
+        finest=config.hash_finest,
+        hidden=config.hidden,
+        half_extent=config.half_extent,
+    )
+    materials = MaterialField(spec)
+    materials.reset(ctx.generator("materials"))
+    if environment is None:
+        size = config.environment_size
+        radiance = torch.full((size, size, 3), config.environment_start)
+    else:
+        radiance = environment.radiance
+    log_environment = nn.Parameter(radiance.clamp_min(MIN_RADIANCE).log().to(ctx.device))
+    materials, volume = materials.to(ctx.device), volume.to(ctx.device)
+    return _Fit.assemble(volume, materials, log_environment, config)
+
+
+def _losses(
+    rendered: Rendered, batch: PixelBlocks, fit: _Fit, step: int, config: NerfConfig
+) -> dict[str, Tensor]:
+    """Weighted loss terms of one batch."""
+    target = batch.targets
+    done = step / config.steps
+
+    def blocks(values: Tensor) -> Tensor:
+        return values.view(-1, PIXELS, values.shape[-1])
+
+    normal = blocks(rendered.normal_geometric)
+    straight = normal / blocks(rendered.mask).clamp_min(MIN_COVERAGE)
+    depth = blocks(rendered.depth) / blocks(rendered.mask).clamp_min(MIN_COVERAGE)
+    both = torch.minimum(blocks(rendered.mask).detach(), target["mask"])
+    normal_weight = config.normal_weight + done * (config.normal_weight_end - config.normal_weight)
+    terms = {
+        "mask": config.mask_weight * ray_losses.mask_loss(blocks(rendered.mask), target["mask"]),
+        "basecolor": config.basecolor_weight
+        * ray_losses.color_loss(blocks(rendered.basecolor), target["basecolor"]),
+        "orm": config.orm_weight
+        * ray_losses.absolute_loss(
+            torch.cat([blocks(rendered.roughness), blocks(rendered.metallic)], -1),
+            torch.cat([target["roughness"], target["metallic"]], -1),
+        ),
+        "normal": normal_weight * ray_losses.absolute_loss(normal, target["normal"]),
+        "eikonal": config.eikonal_weight * ray_losses.unit_gradient_loss(rendered.surface.gradient),
+        "normal_smoothness": config.normal_smoothness_weight
+        * ray_losses.bilateral_loss(straight, target["guide"], both),
+        "depth_smoothness": config.depth_smoothness_weight
+        * ray_losses.depth_smoothness_loss(depth, both, batch.footprint),
+    }
+    if rendered.radiance is not None:
+        terms["radiance"] = config.radiance_weight * ray_losses.radiance_loss(
+            blocks(rendered.radiance), target["radiance"]
+        )
+        light = fit.log_environment.exp()
+        terms["light_balance"] = (
+            config.light_balance_weight * (light - light.mean(-1, keepdim=True)).abs().mean()
+        )
+    if done >= config.bump_start:
+        terms["bump_normal"] = config.bump_normal_weight * ray_losses.absolute_loss(
+            blocks(rendered.normal_shading), target["normal"]
+        )
+        terms["bump_size"] = config.bump_size_weight * rendered.bump.square().mean()
+    return terms
+
+
+def _draw(blocks: PixelBlocks, step: int, config: NerfConfig, ctx: Context) -> PixelBlocks:
+    """The blocks of a step: epochs of random order, each a function of the seed alone."""
+    count = min(config.rays_per_step // PIXELS, len(blocks))
+    per_epoch = len(blocks) // count
+    epoch, place = divmod(step, per_epoch)
+    order = torch.randperm(len(blocks), generator=ctx.generator(f"epoch {epoch}"))
+    return blocks.take(order[place * count : (place + 1) * count].to(ctx.device))
+
+
+def _optimise(fit: _Fit, blocks: PixelBlocks, config: NerfConfig, ctx: Context) -> None:
+    """The loop. State is saved where the empty-space grid is a function of the parameters."""
+    operator = PyramidOperator.build(len(fit.log_environment))
+    first = _resume(fit, config, ctx)
+    growth = {
+        round(share * config.steps): nodes
+        for share, nodes in zip(config.grid_shares, config.grid_nodes, strict=True)
+    }
+    for step in range(first, config.steps):
+        if step in growth and isinstance(fit.volume, SdfVolume) and step > first:
+            fit.grow(growth[step], config)
+        if step % REFRESH_EVERY == 0:
+            if ctx.checkpoints.due():
+                ctx.checkpoints.save(step, fit.adam.state() | dict(fit.volume.named_buffers()))
+            fit.volume.refresh(ctx.generator(f"refresh {step}"))
+        batch = _draw(blocks, step, config, ctx)
+        jitter = torch.rand(config.rays_per_step, generator=ctx.generator(f"jitter {step}"))[
+            : batch.pixels.numel()
+        ]
+        rendered = render_rays(
+            fit.volume,
+            fit.materials,
+            batch.rays(),
+            jitter=jitter.to(ctx.device),
+            pyramid=operator(fit.log_environment.exp()),
+            use_bump=step >= config.bump_start * config.steps,
+            multiple_scattering=config.multiple_scattering,
+        )
+        terms = _losses(rendered, batch, fit, step, config)
+        if ctx.is_finite(step, terms):
+            fit.adam.zero_grad()
+            torch.stack(list(terms.values())).sum().backward()
+            fit.adam.step(
+                config.final_rate ** (step / config.steps) * min(1.0, (step + 1) / WARM_UP)
+            )
+        ctx.report(step + 1, config.steps, {name: float(t.detach()) for name, t in terms.items()})
+
+
+def _resume(fit: _Fit, config: NerfConfig, ctx: Context) -> int:
+    """Take up a checkpoint; returns the step to go on with."""
+    saved = ctx.checkpoints.load()
+    if saved is None:
+        return 0
+    step, tensors = saved
+    nodes = tensors.get(f"value.{SDF}")
+    if nodes is not None and isinstance(fit.volume, SdfVolume):
+        fit.grow(len(nodes), config)
+    fit.adam.load_state(tensors)
+    for name, buffer in fit.volume.named_buffers():
+        buffer.copy_(tensors[name])
+    log.info("nerf: resumed at step %d", step)
+    return step
+
+
+def run(
+    views: MaterialViews,
+    environment: EnvironmentLight | None,
+    *,
+    config: NerfConfig,
+    ctx: Context,
+) -> FittedField:
+    """Fit a field to the views.
+
+    Raises:
+        InputError: fewer than three views, an empty mask, or masks that share no point.
+    """
+    _check(views)
+    planes = _image_planes(views, config.image_size, ctx.device)
+    height, width = planes["mask"].shape[1:3]
+    cameras = views.cameras.to(ctx.device).resized(height, width)
+    hull = _hull(planes["mask"], cameras, config, ctx)
+    planes["guide"] = ray_losses.tonemap(planes["radiance"])
+    blocks = _pixel_blocks(cameras, planes, hull, config)
+    fit = _start(hull, environment, config, ctx)
+    _optimise(fit, blocks, config, ctx)
+    sdf = fit.volume.signed_distance(config.grid_nodes[-1])
+    return FittedField(
+        sdf=without_hidden_parts(sdf, smallest_share=SMALLEST_PART).cpu(),
+        half_extent=config.half_extent,
+        material_spec=fit.materials.spec,
+        material_state={n: t.detach().cpu() for n, t in fit.materials.state_dict().items()},
+        environment=fit.log_environment.detach().exp().cpu(),
+    )
+
+
+NERF = Stage(run)

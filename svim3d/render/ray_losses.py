@@ -1,0 +1,96 @@
+"""Losses on blocks of 2 x 2 composited rays against premultiplied target pixels.
+
+All are means over the batch and of order one when the prediction is useless.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from svim3d.color import srgb_from_linear
+from svim3d.numerics import length
+
+TONE_CURVE = 10.0  # T(x) = log(1 + 10 x) / log 11: equal weight to shadows and highlights
+MASK_MARGIN = 1e-4  # keeps the logarithms of the cross-entropy finite
+MAX_DEPTH_STEP = 5.0  # a plane seen at 79 degrees from its normal
+COLOR_EDGE = 3.0  # a colour step of 1/3 switches smoothing off; Source: SViM3D, bilateral term
+
+
+def tonemap(radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Logarithmic curve with T(0) = 0 and T(1) = 1, unbounded above."""
+    return torch.log1p(TONE_CURVE * radiance.clamp_min(0.0)) / math.log1p(TONE_CURVE)
+
+
+def color_loss(
+    rendered_linear: Float[Tensor, "*batch 3"], target_linear: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, ""]:
+    """Mean absolute difference of sRGB-encoded colours."""
+    return (srgb_from_linear(rendered_linear) - srgb_from_linear(target_linear)).abs().mean()
+
+
+def radiance_loss(
+    rendered: Float[Tensor, "*batch 3"], target: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, ""]:
+    """Mean squared difference of tone-mapped radiance."""
+    return (tonemap(rendered) - tonemap(target)).square().mean()
+
+
+def mask_loss(
+    rendered: Float[Tensor, "*batch 1"], target: Float[Tensor, "*batch 1"]
+) -> Float[Tensor, ""]:
+    """Binary cross-entropy of coverage."""
+    return torch.nn.functional.binary_cross_entropy(
+        rendered.clamp(MASK_MARGIN, 1.0 - MASK_MARGIN), target.clamp(0.0, 1.0)
+    )
+
+
+def absolute_loss(
+    rendered: Float[Tensor, "*batch C"], target: Float[Tensor, "*batch C"]
+) -> Float[Tensor, ""]:
+    """Mean absolute difference, for normals and for values in [0, 1]."""
+    return (rendered - target).abs().mean()
+
+
+def unit_gradient_loss(gradient: Float[Tensor, "*batch 3"]) -> Float[Tensor, ""]:
+    """Eikonal term: a signed distance has |gradient| = 1. Source: Gropp et al. 2020, eq. 2."""
+    return (length(gradient) - 1.0).square().mean() if len(gradient) else gradient.sum()
+
+
+def _neighbours(values: Float[Tensor, "B 4 C"]) -> tuple[Tensor, Tensor]:
+    """The two horizontal and two vertical pairs of each block."""
+    first = values[:, [0, 2, 0, 1]]
+    second = values[:, [1, 3, 2, 3]]
+    return first, second
+
+
+def bilateral_loss(
+    values: Float[Tensor, "B 4 C"],
+    guide: Float[Tensor, "B 4 3"],
+    mask: Float[Tensor, "B 4 1"],
+) -> Float[Tensor, ""]:
+    """|values_i - values_j| exp(-3 |guide_i - guide_j|) over neighbours inside the mask.
+
+    Smooth where the guide (a display-encoded picture) is, free at its edges.
+    """
+    a, b = _neighbours(values)
+    guide_a, guide_b = _neighbours(guide)
+    mask_a, mask_b = _neighbours(mask)
+    same = torch.exp(-COLOR_EDGE * length(guide_a - guide_b)) * torch.minimum(mask_a, mask_b)
+    return (length(a - b) * same).mean()
+
+
+def depth_smoothness_loss(
+    depth: Float[Tensor, "B 4 1"], mask: Float[Tensor, "B 4 1"], pixel: float
+) -> Float[Tensor, ""]:
+    """Squared depth steps between neighbours, in units of the pixel's footprint.
+
+    Steps beyond `MAX_DEPTH_STEP` pixels are edges of the object and left alone.
+    Source: Niemeyer et al. 2022, "RegNeRF", eq. 5, on blocks of 2 x 2.
+    """
+    a, b = _neighbours(depth)
+    mask_a, mask_b = _neighbours(mask)
+    step = (a - b).abs() / pixel
+    inside = (step.detach() < MAX_DEPTH_STEP) * torch.minimum(mask_a, mask_b)
+    return ((step / MAX_DEPTH_STEP).square() * inside).mean()

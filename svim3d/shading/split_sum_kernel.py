@@ -1,0 +1,349 @@
+"""Compiled kernels of split-sum shading: one pass forward, one backward, over a batch of points.
+
+The arithmetic of `split_sum.shade_plainly`, scalar by scalar in double precision. The backward pass
+repeats the forward arithmetic instead of storing it; in it, `g_x` is the derivative of the loss by
+`x`. All kernels live in this file, because numba's cache watches only the file of the caller.
+"""
+
+import math
+from typing import Any
+
+import numba
+from numpy.typing import NDArray
+
+from svim3d.compiled import kernel
+from svim3d.shading.directional_albedo import MIN_N_DOT_V, SCHLICK_MEAN_WEIGHT, TABLE_SIZE
+from svim3d.shading.metallic_roughness import DIELECTRIC_F0
+
+Array = NDArray[Any]
+Triple = tuple[float, float, float]
+Taps = tuple[int, int, int, int, float, float]
+
+
+@kernel(parallel=True)
+def shade_forward(
+    normal: Array,
+    wo: Array,
+    basecolor: Array,
+    roughness: Array,
+    metallic: Array,
+    texels: Array,
+    table: Array,
+    knots: Array,
+    sizes: Array,
+    offsets: Array,
+    multiple_scattering: bool,
+    diffuse: Array,
+    specular: Array,
+) -> None:
+    """One point per iteration."""
+    last = len(knots)
+    for p in numba.prange(len(normal)):
+        r, m = float(roughness[p, 0]), float(metallic[p, 0])
+        _, n_dot_v, dx, dy, dz = _directions(normal[p], wo[p], r)
+        scale, bias, _, _, _, _ = _table_lookup(table, n_dot_v, r)
+        level, fraction, _ = _level(knots, r)
+        sharp = _locate(dx, dy, dz, sizes[level])
+        blurred = _locate(dx, dy, dz, sizes[level + 1])
+        around = _locate(normal[p, 0], normal[p, 1], normal[p, 2], sizes[last])
+        for c in range(3):
+            low, _, _ = _fetch(texels, offsets[level], sharp, sizes[level], c)
+            high, _, _ = _fetch(texels, offsets[level + 1], blurred, sizes[level + 1], c)
+            irradiance, _, _ = _fetch(texels, offsets[last], around, sizes[last], c)
+            radiance = low + fraction * (high - low)
+            f0 = DIELECTRIC_F0 * (1.0 - m) + basecolor[p, c] * m
+            single = f0 * scale + bias
+            multiple = _bounces(f0, single, scale + bias) if multiple_scattering else 0.0
+            albedo = basecolor[p, c] * (1.0 - m)
+            diffuse[p, c] = albedo * (1.0 - single - multiple) * irradiance
+            specular[p, c] = single * radiance + multiple * irradiance
+
+
+@kernel(parallel=True)
+def shade_backward(
+    normal: Array,
+    wo: Array,
+    basecolor: Array,
+    roughness: Array,
+    metallic: Array,
+    texels: Array,
+    table: Array,
+    knots: Array,
+    sizes: Array,
+    offsets: Array,
+    multiple_scattering: bool,
+    grad_diffuse: Array,
+    grad_specular: Array,
+    grad_normal: Array,
+    grad_wo: Array,
+    grad_basecolor: Array,
+    grad_roughness: Array,
+    grad_metallic: Array,
+    grad_texels: Array,
+) -> None:
+    """One chunk of points per iteration, each with its own copy of `grad_texels`."""
+    points, chunks, last = len(normal), len(grad_texels), len(knots)
+    wanted = grad_texels.shape[1] > 0
+    for chunk in numba.prange(chunks):
+        for p in range(chunk * points // chunks, (chunk + 1) * points // chunks):
+            r, m = float(roughness[p, 0]), float(metallic[p, 0])
+            raw, n_dot_v, dx, dy, dz = _directions(normal[p], wo[p], r)
+            scale, bias, scale_v, bias_v, scale_r, bias_r = _table_lookup(table, n_dot_v, r)
+            level, fraction, slope = _level(knots, r)
+            sharp = _locate(dx, dy, dz, sizes[level])
+            blurred = _locate(dx, dy, dz, sizes[level + 1])
+            around = _locate(normal[p, 0], normal[p, 1], normal[p, 2], sizes[last])
+            g_scale, g_bias, g_fraction, g_m = 0.0, 0.0, 0.0, 0.0
+            g_u, g_v, g_around_u, g_around_v = 0.0, 0.0, 0.0, 0.0
+            for c in range(3):
+                low, low_u, low_v = _fetch(texels, offsets[level], sharp, sizes[level], c)
+                high, high_u, high_v = _fetch(
+                    texels, offsets[level + 1], blurred, sizes[level + 1], c
+                )
+                irradiance, around_u, around_v = _fetch(
+                    texels, offsets[last], around, sizes[last], c
+                )
+                g_low, g_high, g_irradiance, g_base, g_metal, g_a, g_b = _channel_adjoint(
+                    basecolor[p, c],
+                    m,
+                    scale,
+                    bias,
+                    multiple_scattering,
+                    low + fraction * (high - low),
+                    irradiance,
+                    fraction,
+                    grad_diffuse[p, c],
+                    grad_specular[p, c],
+                )
+                grad_basecolor[p, c] = g_base
+                g_m, g_scale, g_bias = g_m + g_metal, g_scale + g_a, g_bias + g_b
+                g_fraction += (g_low + g_high) * (high - low)
+                g_u += g_low * low_u + g_high * high_u
+                g_v += g_low * low_v + g_high * high_v
+                g_around_u += g_irradiance * around_u
+                g_around_v += g_irradiance * around_v
+                if wanted:
+                    _scatter(grad_texels[chunk], offsets[level], sharp, c, g_low)
+                    _scatter(grad_texels[chunk], offsets[level + 1], blurred, c, g_high)
+                    _scatter(grad_texels[chunk], offsets[last], around, c, g_irradiance)
+            bounded = MIN_N_DOT_V <= raw <= 1.0
+            g_dot = g_scale * scale_v + g_bias * bias_v if bounded else 0.0
+            g_direction = _square_adjoint(dx, dy, dz, g_u, g_v)
+            g_bend = _direction_adjoint(
+                normal[p], wo[p], raw, r, g_direction, g_dot, grad_normal[p], grad_wo[p]
+            )
+            g_around = _square_adjoint(
+                normal[p, 0], normal[p, 1], normal[p, 2], g_around_u, g_around_v
+            )
+            for k in range(3):
+                grad_normal[p, k] += g_around[k]
+            g_r = g_scale * scale_r + g_bias * bias_r + g_fraction * slope
+            grad_roughness[p, 0] = g_r + g_bend * 3.0 * r * r
+            grad_metallic[p, 0] = g_m
+
+
+@kernel()
+def _bounces(f0: float, single: float, evenly_lit: float) -> float:
+    """Albedo of all bounces after the first; see `directional_albedo.lobe_albedos`."""
+    escaped = 1.0 - evenly_lit
+    mean = f0 + (1.0 - f0) * SCHLICK_MEAN_WEIGHT
+    return escaped * single * mean / (1.0 - mean * escaped)
+
+
+@kernel()
+def _channel_adjoint(
+    base: float,
+    m: float,
+    scale: float,
+    bias: float,
+    multiple_scattering: bool,
+    radiance: float,
+    irradiance: float,
+    fraction: float,
+    g_diffuse: float,
+    g_specular: float,
+) -> tuple[float, float, float, float, float, float, float]:
+    """Derivatives by both levels' radiance, irradiance, base colour, metallic, A and B."""
+    f0, albedo = DIELECTRIC_F0 * (1.0 - m) + base * m, base * (1.0 - m)
+    single, multiple, gain = f0 * scale + bias, 0.0, 0.0
+    escaped = 1.0 - (scale + bias)
+    mean = f0 + (1.0 - f0) * SCHLICK_MEAN_WEIGHT
+    if multiple_scattering:
+        gain = 1.0 / (1.0 - mean * escaped)
+        multiple = escaped * single * mean * gain
+    transmitted = 1.0 - single - multiple
+    # Through the products to radiance, irradiance and the three shares.
+    g_radiance = g_specular * single
+    g_irradiance = g_specular * multiple + g_diffuse * albedo * transmitted
+    g_albedo = g_diffuse * transmitted * irradiance
+    g_multiple = (g_specular - g_diffuse * albedo) * irradiance
+    g_single = g_specular * radiance - g_diffuse * albedo * irradiance
+    # Through the geometric series of bounces; `gain` is zero without them.
+    g_single += g_multiple * escaped * mean * gain
+    g_escaped = g_multiple * single * mean * gain * gain
+    g_mean = g_multiple * single * escaped * gain * gain
+    g_f0 = g_single * scale + g_mean * (1.0 - SCHLICK_MEAN_WEIGHT)
+    return (
+        g_radiance * (1.0 - fraction),
+        g_radiance * fraction,
+        g_irradiance,
+        g_f0 * m + g_albedo * (1.0 - m),
+        g_f0 * (base - DIELECTRIC_F0) - g_albedo * base,
+        g_single * f0 - g_escaped,
+        g_single - g_escaped,
+    )
+
+
+@kernel()
+def _direction_adjoint(
+    normal: Array,
+    wo: Array,
+    raw: float,
+    r: float,
+    g_direction: Triple,
+    g_dot: float,
+    grad_normal: Array,
+    grad_wo: Array,
+) -> float:
+    """Write the derivatives by normal and view; return the one by the bend, r^3.
+
+    direction = mirror + r^3 (normal - mirror), mirror = 2 (n.v) n - v.
+    """
+    bend, g_bend = r * r * r, 0.0
+    for k in range(3):
+        mirror = 2.0 * raw * normal[k] - wo[k]
+        g_bend += g_direction[k] * (normal[k] - mirror)
+        g_dot += 2.0 * (1.0 - bend) * g_direction[k] * normal[k]
+    for k in range(3):
+        g_mirror = (1.0 - bend) * g_direction[k]
+        grad_normal[k] = bend * g_direction[k] + 2.0 * raw * g_mirror + g_dot * wo[k]
+        grad_wo[k] = g_dot * normal[k] - g_mirror
+    return g_bend
+
+
+@kernel()
+def _directions(normal: Array, wo: Array, r: float) -> tuple[float, float, float, float, float]:
+    """n.v as it is and within its bounds, and the dominant direction (not unit)."""
+    raw = float(normal[0]) * wo[0] + float(normal[1]) * wo[1] + float(normal[2]) * wo[2]
+    straight = 2.0 * raw * (1.0 - r * r * r) + r * r * r
+    against = 1.0 - r * r * r
+    return (
+        raw,
+        min(max(raw, MIN_N_DOT_V), 1.0),
+        straight * normal[0] - against * wo[0],
+        straight * normal[1] - against * wo[1],
+        straight * normal[2] - against * wo[2],
+    )
+
+
+@kernel()
+def _table_lookup(
+    table: Array, n_dot_v: float, r: float
+) -> tuple[float, float, float, float, float, float]:
+    """A, B, and their derivatives by n.v and by roughness."""
+    root, span = math.sqrt(n_dot_v), TABLE_SIZE - 1
+    x, y = root * span, min(max(r, 0.0), 1.0) * span
+    x0, y0 = min(int(x), TABLE_SIZE - 2), min(int(y), TABLE_SIZE - 2)
+    fx, fy = x - x0, y - y0
+    along, within = span / (2.0 * root), float(span) if 0.0 <= r <= 1.0 else 0.0
+    low_a = table[y0, x0, 0] + fx * (table[y0, x0 + 1, 0] - table[y0, x0, 0])
+    low_b = table[y0, x0, 1] + fx * (table[y0, x0 + 1, 1] - table[y0, x0, 1])
+    high_a = table[y0 + 1, x0, 0] + fx * (table[y0 + 1, x0 + 1, 0] - table[y0 + 1, x0, 0])
+    high_b = table[y0 + 1, x0, 1] + fx * (table[y0 + 1, x0 + 1, 1] - table[y0 + 1, x0, 1])
+    slope_a = (1.0 - fy) * (table[y0, x0 + 1, 0] - table[y0, x0, 0])
+    slope_a += fy * (table[y0 + 1, x0 + 1, 0] - table[y0 + 1, x0, 0])
+    slope_b = (1.0 - fy) * (table[y0, x0 + 1, 1] - table[y0, x0, 1])
+    slope_b += fy * (table[y0 + 1, x0 + 1, 1] - table[y0 + 1, x0, 1])
+    return (
+        low_a + fy * (high_a - low_a),
+        low_b + fy * (high_b - low_b),
+        slope_a * along,
+        slope_b * along,
+        (high_a - low_a) * within,
+        (high_b - low_b) * within,
+    )
+
+
+@kernel()
+def _level(knots: Array, r: float) -> tuple[int, float, float]:
+    """Level below a roughness, fraction towards the next, and its derivative by roughness."""
+    level = 0
+    while level < len(knots) - 2 and r >= knots[level + 1]:
+        level += 1
+    slope = 1.0 / (float(knots[level + 1]) - knots[level])
+    fraction = (r - knots[level]) * slope
+    if fraction < 0.0 or fraction > 1.0:
+        return level, min(max(fraction, 0.0), 1.0), 0.0
+    return level, fraction, slope
+
+
+@kernel()
+def _locate(x: float, y: float, z: float, size: int) -> Taps:
+    """Four texels around a direction and the position between them."""
+    norm = abs(x) + abs(y) + abs(z)
+    u, v = x / norm, z / norm
+    if y < 0.0:
+        u, v = (1.0 - abs(v)) * _sign(u), (1.0 - abs(u)) * _sign(v)
+    column, row = (u * 0.5 + 0.5) * size - 0.5, (v * 0.5 + 0.5) * size - 0.5
+    j, i = math.floor(column), math.floor(row)
+    return (
+        _wrap(i, j, size),
+        _wrap(i, j + 1, size),
+        _wrap(i + 1, j, size),
+        _wrap(i + 1, j + 1, size),
+        column - j,
+        row - i,
+    )
+
+
+@kernel()
+def _sign(x: float) -> float:
+    """Sign that counts zero as positive."""
+    return 1.0 if x >= 0.0 else -1.0
+
+
+@kernel()
+def _wrap(i: int, j: int, size: int) -> int:
+    """Flat index of a texel at most one beyond the square; see `octahedral.bilinear_taps`."""
+    if j < 0 or j >= size:
+        i, j = size - 1 - i, min(max(j, 0), size - 1)
+    if i < 0 or i >= size:
+        j, i = size - 1 - j, min(max(i, 0), size - 1)
+    return i * size + j
+
+
+@kernel()
+def _fetch(texels: Array, offset: int, taps: Taps, size: int, c: int) -> Triple:
+    """Bilinear value and its derivatives by the square coordinates u and v."""
+    a, b = texels[offset + taps[0], c], texels[offset + taps[1], c]
+    d, e = texels[offset + taps[2], c], texels[offset + taps[3], c]
+    fx, fy, per_texel = taps[4], taps[5], 0.5 * size
+    top, bottom = a * (1.0 - fx) + b * fx, d * (1.0 - fx) + e * fx
+    along_u = (b - a) * (1.0 - fy) + (e - d) * fy
+    return top * (1.0 - fy) + bottom * fy, along_u * per_texel, (bottom - top) * per_texel
+
+
+@kernel()
+def _scatter(grad: Array, offset: int, taps: Taps, c: int, value: float) -> None:
+    """Adjoint of `_fetch`."""
+    fx, fy = taps[4], taps[5]
+    grad[offset + taps[0], c] += (1.0 - fx) * (1.0 - fy) * value
+    grad[offset + taps[1], c] += fx * (1.0 - fy) * value
+    grad[offset + taps[2], c] += (1.0 - fx) * fy * value
+    grad[offset + taps[3], c] += fx * fy * value
+
+
+@kernel()
+def _square_adjoint(x: float, y: float, z: float, g_u: float, g_v: float) -> Triple:
+    """Derivative by the direction, given those by its square coordinates."""
+    norm = abs(x) + abs(y) + abs(z)
+    a, b = x / norm, z / norm
+    g_a, g_b = g_u, g_v
+    if y < 0.0:
+        g_a, g_b = -g_v * _sign(a) * _sign(b), -g_u * _sign(a) * _sign(b)
+    shared = (g_a * a + g_b * b) / norm
+    return (
+        g_a / norm - shared * _sign(x),
+        -shared * _sign(y),
+        g_b / norm - shared * _sign(z),
+    )

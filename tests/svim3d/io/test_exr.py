@@ -1,0 +1,52 @@
+"""EXR planes survive the disk bit by bit; what is no EXR is refused by name."""
+
+import numpy as np
+import pytest
+
+from svim3d.io.exr import read_exr, read_rgb, write_exr, write_rgb
+
+
+def test_half_values_round_trip_bit_exact(tmp_path):
+    rng = np.random.default_rng(0)
+    planes = {
+        name: rng.normal(size=(7, 5)).astype(np.float16).astype(np.float32)
+        for name in ("R", "G", "B", "A", "normal.X", "roughness.V")
+    }
+    write_exr(tmp_path / "a.exr", planes)
+    back = read_exr(tmp_path / "a.exr")
+    assert set(back) == set(planes)
+    for name, plane in planes.items():
+        assert np.array_equal(back[name], plane)
+
+
+def test_full_precision_round_trips_bit_exact(tmp_path):
+    rgb = np.random.default_rng(1).normal(size=(4, 6, 3)).astype(np.float32) * 1e6
+    write_rgb(tmp_path / "a.exr", rgb, half=False)
+    assert np.array_equal(read_rgb(tmp_path / "a.exr"), rgb)
+
+
+def test_depth_keeps_full_precision_beside_half_channels(tmp_path):
+    depth = np.full((2, 2), 2.000123, np.float32)
+    write_exr(tmp_path / "a.exr", {"R": depth, "depth.Z": depth})
+    back = read_exr(tmp_path / "a.exr")
+    assert np.array_equal(back["depth.Z"], depth)
+    assert not np.array_equal(back["R"], depth)
+
+
+def test_values_beyond_half_are_clipped_not_infinite(tmp_path):
+    write_rgb(tmp_path / "a.exr", np.full((2, 2, 3), 1e6, np.float32))
+    assert float(read_rgb(tmp_path / "a.exr").max()) == 65504.0
+
+
+@pytest.mark.parametrize("content", [b"", b"not an image", b"\x76\x2f\x31\x01 truncated"])
+def test_unreadable_file_is_named(tmp_path, content):
+    file = tmp_path / "broken.exr"
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=r"broken\.exr"):
+        read_exr(file)
+
+
+def test_missing_colour_channels_are_named(tmp_path):
+    write_exr(tmp_path / "a.exr", {"R": np.zeros((2, 2), np.float32)})
+    with pytest.raises(ValueError, match="'G', 'B'"):
+        read_rgb(tmp_path / "a.exr")
