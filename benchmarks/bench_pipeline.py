@@ -199,12 +199,12 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     parser.add_argument("--skip", action="append", default=[], help="a stage to leave out")
     parser.add_argument("--seed", type=int, default=0)
-    results = ROOT / "benchmarks" / "results"
-    parser.add_argument("--results", type=Path, default=results)
-    parser.add_argument("--store", type=Path, default=results / "store")
+    parser.add_argument("--results", type=Path, default=ROOT / "benchmarks" / "results")
+    parser.add_argument("--store", type=Path, help="of artifacts; default: store in the results")
     parser.add_argument("--keep", action="store_true", help="keep results of other code as well")
     given = parser.parse_args()
     given.data = Path(given.data)
+    given.store = given.store or given.results / "store"
     given.results.mkdir(parents=True, exist_ok=True)
     rows = []
     # Point by point over all assets: the first rows already compare assets.
