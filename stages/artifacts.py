@@ -11,6 +11,7 @@ from typing import Self
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from svim3d.cameras import Cameras
 from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
@@ -19,6 +20,7 @@ from svim3d.io.image import read_png, write_png
 from svim3d.io.orbit import read_orbit, write_orbit
 from svim3d.io.weights import load_tensors, save_tensors
 from svim3d.mesh.marching import extract_surface
+from svim3d.numerics import normalize
 from svim3d.shading.environment import latlong_from_octahedral
 
 
@@ -45,6 +47,30 @@ class MaterialViews:
     metallic: Float[Tensor, "V H W 1"]
     normal_world: Float[Tensor, "V H W 3"]
     reference: int
+
+    def premultiplied(self, longest_px: int) -> tuple[Cameras, dict[str, Tensor]]:
+        """What an optimisation compares renders with: images times coverage, cameras to match.
+
+        Args:
+            longest_px: larger views are averaged down by a whole factor to at most this size; rows
+                and columns that do not fill a block are cut.
+        """
+        planes = {
+            "mask": self.mask,
+            "radiance": self.radiance,
+            "basecolor": self.basecolor * self.mask,
+            "roughness": self.roughness * self.mask,
+            "metallic": self.metallic * self.mask,
+            "normal_world": normalize(self.normal_world) * self.mask,
+        }
+        factor = -(-max(self.cameras.height, self.cameras.width) // longest_px)
+        if factor > 1:
+            planes = {
+                name: avg_pool2d(plane.permute(0, 3, 1, 2), factor).permute(0, 2, 3, 1).contiguous()
+                for name, plane in planes.items()
+            }
+        height, width = planes["mask"].shape[1:3]
+        return self.cameras.resized(height, width), planes
 
     def save(self, folder: Path) -> None:
         """Write an orbit folder (the exchange format, see README)."""

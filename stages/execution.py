@@ -60,7 +60,7 @@ def run_stage(
     """
 
     def compute(payload: Path, work: Path) -> dict[str, Any]:
-        start = time.monotonic()
+        start, cpu_start = time.monotonic(), time.process_time()
         _reset_peak_memory(device)
         with Context(
             recipe.stage, device, recipe.seed, work, store.shared, on_progress=on_progress
@@ -71,6 +71,7 @@ def run_stage(
             artifact.save(payload)
         return {
             "seconds": round(time.monotonic() - start, 3),
+            "cpu_seconds": round(time.process_time() - cpu_start, 3),
             "peak_memory_mib": _peak_memory_mib(device),
             "headline": artifact.headline(),
             "events": ctx.events,

@@ -132,12 +132,12 @@ def code_digests(module: str) -> dict[str, str]:
         file = _file_of(name)
         if name in found or name.partition(".")[0] not in packages or is_settings or file is None:
             continue
-        found[name], imported = _read_module(name, file, file.stat().st_mtime_ns)
+        package = name if file.name == "__init__.py" else name.rpartition(".")[0]
+        found[name], imported = _read_module(package, file.read_bytes())
         queue.extend(imported)
     return dict(sorted(found.items()))
 
 
-@functools.cache
 def _folder_of(package: str) -> Path | None:
     """Where a top-level package lies; finding it runs none of its code."""
     spec = importlib.util.find_spec(package)
@@ -158,10 +158,9 @@ def _file_of(module: str) -> Path | None:
 
 
 @functools.cache
-def _read_module(module: str, file: Path, mtime_ns: int) -> tuple[str, tuple[str, ...]]:
-    """Digest of a module's code and the names that it may import; the time keeps it fresh."""
-    tree = ast.parse(file.read_bytes(), filename=str(file))
-    package = module if file.name == "__init__.py" else module.rpartition(".")[0]
+def _read_module(package: str, source: bytes) -> tuple[str, tuple[str, ...]]:
+    """Digest of a module's code and the names that it may import; `package` is where it lies."""
+    tree = ast.parse(source)
     imported = tuple(_imported_names(tree, package))
     _drop_docstrings(tree)
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest(), imported

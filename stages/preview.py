@@ -35,7 +35,7 @@ TEXT_PX, TITLE_PX = 13, 15
 AIR = 1.06  # pictures are cropped to the object and this much around it
 MIN_COVERAGE = 0.5  # pixels that the object mostly covers are compared
 
-Images = dict[str, Float[Tensor, "V H W C"]]
+Images = dict[str, Float[Tensor, "_ _ _ _"]]  # [views, rows, columns, channels]
 
 
 @dataclass(frozen=True)

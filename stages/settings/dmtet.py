@@ -1,7 +1,60 @@
-"""Settings of the dmtet stage."""
+"""Settings of phase 2."""
+
+from typing import Annotated
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from stages.settings.base import StageConfig
 
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
 
 class DmtetConfig(StageConfig):
-    """Phase 2, the refined surface."""
+    """Phase 2: refine an explicit surface, its materials and its light on whole images."""
+
+    steps: PositiveInt = 250
+    """Optimiser steps. The paper takes 1500."""
+    views_per_step: PositiveInt = 1
+    """Views rendered in each step."""
+    image_size: PositiveInt = 256
+    """Longest side that larger views are averaged down to, pixels."""
+    cells: Annotated[int, Field(ge=8, le=256)] = 96
+    """Cells of the tetrahedral lattice along each side of the field's cube."""
+    reach: PositiveFloat = 2.0
+    """How far the surface may move from phase 1's, in cells; farther nodes are not kept."""
+
+    sdf_rate: NonNegativeFloat = 0.01
+    """Adam step of the signed distance, in cells."""
+    offset_rate: NonNegativeFloat = 0.01
+    """Adam step of the nodes' offsets, in units of their limit."""
+    field_rate: NonNegativeFloat = 2e-3
+    """Adam step of the material field's hash grid; it starts fitted, so a fifth of phase 1's."""
+    network_rate: NonNegativeFloat = 1e-3
+    """Adam step of the material network."""
+    environment_rate: NonNegativeFloat = 5e-3
+    """Adam step of the log radiance; 0 keeps the light as it came."""
+    final_rate: Share = 0.1
+    """All rates decay exponentially to this share."""
+    multiple_scattering: bool = True
+    """Give back the energy that rough metals lose to single scattering (Fdez-Aguera 2019)."""
+
+    mask_weight: NonNegativeFloat = 1.0
+    """Squared difference of coverage."""
+    basecolor_weight: NonNegativeFloat = 1.0
+    """Absolute difference in sRGB."""
+    orm_weight: NonNegativeFloat = 0.5
+    """Absolute difference of roughness and metallic."""
+    normal_weight: NonNegativeFloat = 0.5
+    """Absolute difference of shading normals."""
+    radiance_weight: NonNegativeFloat = 0.5
+    """Squared difference of tone-mapped radiance."""
+    normal_smoothness_weight: NonNegativeFloat = 0.02
+    """Bilateral smoothness of shading normals."""
+    sign_change_weight: NonNegativeFloat = 0.02
+    """SDF sign regulariser at the start; Source: nvdiffrec, which starts at 0.2 from noise."""
+    sign_change_weight_end: NonNegativeFloat = 0.005
+    """The same from a quarter of the steps on."""
+    laplacian_weight: NonNegativeFloat = 0.02
+    """Squared distance from the neighbours' mean, in cells; too much erases thin parts."""
+    light_balance_weight: NonNegativeFloat = 0.005
+    """Distance of the light's colour from grey; Source: nvdiffrec."""

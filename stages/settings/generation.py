@@ -12,25 +12,25 @@ from stages.settings.base import StageConfig
 class GenerationConfig(StageConfig):
     """How a mesh or a scene is turned into views; an orbit folder is taken as it is."""
 
-    views: int = Field(21, ge=3, le=200)
+    views: int = Field(default=21, ge=3, le=200)
     """Cameras on the orbit; the last is the reference. Source: SV3D, 21 frames."""
 
-    size: int = Field(256, ge=16, le=2048)
+    size: int = Field(default=256, ge=16, le=2048)
     """Image rows and columns, pixels."""
 
-    fov_y_deg: float = Field(33.8, gt=1.0, lt=120.0)
+    fov_y_deg: float = Field(default=33.8, gt=1.0, lt=120.0)
     """Vertical field of view, degrees. Source: SV3D."""
 
-    elevation_mean_deg: float = Field(10.0, gt=-60.0, lt=60.0)
+    elevation_mean_deg: float = Field(default=10.0, gt=-60.0, lt=60.0)
     """Mean elevation of the orbit, degrees."""
 
-    elevation_swing_deg: float = Field(20.0, ge=0.0, lt=30.0)
+    elevation_swing_deg: float = Field(default=20.0, ge=0.0, lt=30.0)
     """Elevation rises and falls by this much around the orbit, degrees; 0 is a static orbit."""
 
-    radius: float | None = Field(None, gt=0.9, le=100.0)
+    radius: float | None = Field(default=None, gt=0.9, le=100.0)
     """Distance of the cameras from the origin, world units; None fits the object to the image."""
 
-    fill: float = Field(0.85, gt=0.1, le=1.0)
+    fill: float = Field(default=0.85, gt=0.1, le=1.0)
     """Share of the image's height that the object's bounding sphere takes when radius is None."""
 
     environment: Path | None = None
@@ -39,10 +39,10 @@ class GenerationConfig(StageConfig):
     environment_sha256: str | None = None
     """Digest of that file, filled in by itself, so that another light makes another artifact."""
 
-    environment_size: int = Field(128, ge=16, le=1024)
+    environment_size: int = Field(default=128, ge=16, le=1024)
     """Side of the octahedral light map, pixels, a power of two."""
 
-    supersample: int = Field(3, ge=1, le=8)
+    supersample: int = Field(default=3, ge=1, le=8)
     """Samples per pixel and axis."""
 
     @model_validator(mode="before")

@@ -36,7 +36,10 @@ def read_obj(file: Path) -> SourceMesh:
     geometry = [part for part in loaded.get("geometry", {}).values() if len(part["faces"])]
     if not geometry:
         raise ValueError(f"{file.name} holds no triangles")
-    materials = tuple(_material(part.get("visual"), file.parent) for part in geometry)
+    libraries = _libraries(file)
+    materials = tuple(
+        _material(libraries.get(_material_name(part), {}), file.parent) for part in geometry
+    )
     return merge([_part(part, index, materials) for index, part in enumerate(geometry)])
 
 
@@ -59,40 +62,57 @@ def _part(part: dict[str, Any], index: int, materials: tuple[SourceMaterial, ...
     )
 
 
-def _material(visual: Any, folder: Path) -> SourceMaterial:
-    """Material of one part; trimesh keeps the raw MTL values of every key in lower case."""
-    keys: dict[str, Any] = getattr(getattr(visual, "material", None), "kwargs", None) or {}
+def _material_name(part: dict[str, Any]) -> str:
+    """Name after `usemtl`; empty where there is none."""
+    return str(getattr(getattr(part.get("visual"), "material", None), "name", "") or "")
 
-    def number(key: str) -> float | None:
-        value = keys.get(key)
-        return None if value is None else float(np.ravel(value)[0])
+
+def _libraries(file: Path) -> dict[str, dict[str, str]]:
+    """Lower-case keys and raw values of every material in the MTL files that exist."""
+    found: dict[str, dict[str, str]] = {}
+    for line in file.read_text(errors="replace").splitlines():
+        key, _, name = line.strip().partition(" ")
+        library = file.parent / name.strip()
+        if key != "mtllib" or not library.is_file():
+            continue
+        current: dict[str, str] = {}
+        for entry in library.read_text(errors="replace").splitlines():
+            key, _, value = entry.strip().partition(" ")
+            if key.lower() == "newmtl":
+                current = found.setdefault(value.strip(), {})
+            elif key and not key.startswith("#"):
+                current[key.lower()] = value.strip()
+    return found
+
+
+def _material(keys: dict[str, str], folder: Path) -> SourceMaterial:
+    """A material from its MTL entries."""
 
     def texture(key: str, *, srgb: bool = False) -> Tensor | None:
-        name = keys.get(key)
-        if name is None:
+        if key not in keys:
             return None
         # Options come before the name; separators may be those of another system.
-        picture = folder / str(np.ravel(name)[-1]).replace("\\", "/")
+        picture = folder / keys[key].split()[-1].replace("\\", "/")
         if not picture.is_file():
             raise ValueError(f"texture {picture.name} named by the MTL file is missing")
         image = decode_image(picture.read_bytes(), srgb=srgb)
-        return (
-            image[..., :3] if image.shape[-1] >= 3 else image[..., :1].expand(*image.shape[:2], 3)
-        )
+        if image.shape[-1] < 3:  # grey, perhaps with opacity
+            return image[..., :1].expand(*image.shape[:2], 3)
+        return image[..., :3]
 
     basecolor = texture("map_kd", srgb=True)
     roughness, metallic = texture("map_pr"), texture("map_pm")
-    shininess = number("ns")
     # Blinn-Phong exponent to GGX: alpha^2 = 2 / (exponent + 2). Source: Walter et al. 2007.
-    fallback = DEFAULT_ROUGHNESS if shininess is None else (2.0 / (shininess + 2.0)) ** 0.25
-    color = [float(c) for c in keys.get("kd", DEFAULT_COLOR)]
+    shiny = "ns" in keys
+    fallback = (2.0 / (float(keys["ns"]) + 2.0)) ** 0.25 if shiny else DEFAULT_ROUGHNESS
+    color = [float(c) for c in keys["kd"].split()] if "kd" in keys else DEFAULT_COLOR
     normal = texture("norm")
     return SourceMaterial(
         basecolor_factor=(1.0, 1.0, 1.0)
         if basecolor is not None
         else (color[0], color[1], color[2]),
-        roughness_factor=1.0 if roughness is not None else number("pr") or fallback,
-        metallic_factor=1.0 if metallic is not None else number("pm") or 0.0,
+        roughness_factor=1.0 if roughness is not None else float(keys.get("pr", fallback)),
+        metallic_factor=1.0 if metallic is not None else float(keys.get("pm", 0.0)),
         basecolor=basecolor,
         roughness_metallic=_paired(roughness, metallic),
         normal_tangent=None if normal is None else normalize(normal * 2.0 - 1.0),

@@ -33,7 +33,7 @@ CHANNELS = {
 INDEX = "orbit.json"
 RIGID_TOLERANCE = 1e-3  # poses written with 4 decimals pass, mirrored or scaled ones do not
 
-Images = dict[str, Float[Tensor, "V H W C"]]
+Images = dict[str, Float[Tensor, "_ _ _ _"]]  # [views, rows, columns, channels]
 
 
 def write_orbit(
@@ -185,7 +185,7 @@ def _is_rigid(pose: Float[Tensor, "4 4"]) -> bool:
     )
 
 
-def _read_view(file: Path, height: int, width: int) -> dict[str, Float[Tensor, "H W C"]]:
+def _read_view(file: Path, height: int, width: int) -> dict[str, Float[Tensor, "_ _ _"]]:
     """The images of one view."""
     planes = read_exr(file)
     wanted = [channel for channels in CHANNELS.values() for channel in channels]

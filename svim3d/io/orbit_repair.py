@@ -19,7 +19,7 @@ OBJECT_HALF_EXTENT = 0.5  # the object's longest side is 1, centred
 MAX_SHARE_OUTSIDE = 0.01  # of covered pixels that look past the object's cube
 
 Notify = Callable[[str, str], None]
-Images = dict[str, Float[Tensor, "V H W C"]]
+Images = dict[str, Float[Tensor, "_ _ _ _"]]  # [views, rows, columns, channels]
 
 
 def _log(kind: str, message: str) -> None:

@@ -56,9 +56,10 @@ def read_scene(file: Path) -> SourceMesh:
 def _body(part: dict[str, Any]) -> Body:
     """The surface of one part."""
     if "lathe" in part:
-        profile = torch.tensor(part["lathe"])
+        profile = torch.tensor(part["lathe"], dtype=torch.float32)
         return revolve(profile, rounds=SMOOTHING_ROUNDS, segments=LATHE_SEGMENTS)
-    return sweep(torch.tensor(part["tube"]), rounds=SMOOTHING_ROUNDS, segments=TUBE_SEGMENTS)
+    path = torch.tensor(part["tube"], dtype=torch.float32)
+    return sweep(path, rounds=SMOOTHING_ROUNDS, segments=TUBE_SEGMENTS)
 
 
 def _source_mesh(body: Body, material: int, materials: tuple[SourceMaterial, ...]) -> SourceMesh:
@@ -96,7 +97,8 @@ def _paint(
     """Basecolor, roughness and metallic of a material over (along, around)."""
     weight = _pattern(material, around, along)[..., None]
     first, second = (
-        torch.tensor([*material["basecolor"][end], material["roughness"][end]]) for end in (0, -1)
+        torch.tensor([*material["basecolor"][end], float(material["roughness"][end])])
+        for end in (0, -1)
     )
     mixed = first + weight * (second - first)
     return torch.cat([mixed, torch.full_like(weight, float(material["metallic"]))], -1)

@@ -99,7 +99,7 @@ def sweep(path: Float[Tensor, "K 4"], *, rounds: int, segments: int) -> Body:
     return _grid_body(vertices, normals, v)
 
 
-def _tangents(extended: Float[Tensor, "M+2 D"]) -> Float[Tensor, "M D"]:
+def _tangents(extended: Float[Tensor, "E D"]) -> Float[Tensor, "E-2 D"]:
     """Central differences of a curve that is given with one more point at either end."""
     return extended[2:] - extended[:-2]
 

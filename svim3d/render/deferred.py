@@ -20,6 +20,8 @@ from svim3d.raster.interpolation import interpolate
 from svim3d.raster.silhouettes import antialias
 from svim3d.raster.texture import sample_texture
 from svim3d.raster.zbuffer import rasterize
+from svim3d.shading.prefilter import EnvironmentPyramid
+from svim3d.shading.split_sum import shade
 
 MIN_COVERAGE = 1e-4  # below it a straight colour is undefined and stays zero
 
@@ -123,7 +125,24 @@ class RenderedView:
         )
 
 
-CHANNELS = (1, 3, 1, 1, 3, 1, 3)  # of the images of a RenderedView, in their order
+def environment_shader(pyramid: EnvironmentPyramid, *, multiple_scattering: bool = True) -> Shader:
+    """Split-sum shading by a prefiltered environment; differentiable in it."""
+
+    def radiance(normal: Tensor, wo: Tensor, material: Materials) -> Tensor:
+        return shade(
+            normal,
+            wo,
+            material.basecolor,
+            material.roughness,
+            material.metallic,
+            pyramid,
+            multiple_scattering=multiple_scattering,
+        ).radiance
+
+    return radiance
+
+
+CHANNELS = [1, 3, 1, 1, 3, 1, 3]  # of the images of a RenderedView, in their order
 
 
 def render_mesh(

@@ -29,7 +29,7 @@ ATTRIBUTES = {"uv": 2, "tangent": 4, "color": 3}
 
 def render_pictures(
     mesh: SourceMesh, cameras: Cameras, shader: Shader, *, supersample: int
-) -> dict[str, Float[Tensor, "V H W C"]]:
+) -> dict[str, Float[Tensor, "_ _ _ _"]]:
     """Render all views; both sides of a face are seen.
 
     Args:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from svim3d.numerics import normalize
 
+MIN_L1_NORM = 1e-12  # sends the zero vector (no surface there) to the pole instead of to NaN
 DOUBLE = torch.empty(0, dtype=torch.float64)  # a `like` for tables that are built once
 
 
@@ -25,8 +26,8 @@ def _sign(x: Tensor) -> Tensor:
 
 
 def octahedral_from_direction(d: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
-    """Square coordinates (u, v) in [-1, 1] of non-zero directions of any length."""
-    x, y, z = (d / d.abs().sum(-1, keepdim=True)).unbind(-1)
+    """Square coordinates (u, v) in [-1, 1] of directions of any length."""
+    x, y, z = (d / d.abs().sum(-1, keepdim=True).clamp_min(MIN_L1_NORM)).unbind(-1)
     upper = y >= 0
     u = torch.where(upper, x, (1.0 - z.abs()) * _sign(x))
     v = torch.where(upper, z, (1.0 - x.abs()) * _sign(z))
@@ -97,6 +98,15 @@ def sample_octahedral(
     indices, weights = bilinear_taps(d, n)
     texels = radiance.reshape(-1, channels).index_select(0, indices.reshape(-1))
     return (texels.view(-1, 4, channels) * weights[..., None]).sum(1)
+
+
+def total_variation(values: Float[Tensor, "n n c"]) -> Float[Tensor, ""]:
+    """Mean absolute difference of texels that touch on the sphere, seams included."""
+    inner = [values[1:] - values[:-1], values[:, 1:] - values[:, :-1]]
+    # Along each edge of the square, a texel touches its mirror image in the edge's middle.
+    edges = torch.stack([values[0], values[-1], values[:, 0], values[:, -1]])
+    seams = [edges - edges.flip(1)]
+    return torch.cat([d.abs().reshape(-1) for d in inner + seams]).mean()
 
 
 def _texel_centres(n: int, like: Tensor | None) -> Float[Tensor, "n"]:

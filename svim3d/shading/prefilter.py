@@ -19,7 +19,7 @@ from typing import Literal, Self
 import numpy as np
 import scipy.sparse
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from svim3d.shading.linear_operator import SparseOperator
@@ -40,10 +40,10 @@ SAMPLED_IRRADIANCE_COUNT = 16  # Source: SViM3D, section 4
 SAMPLED_SHIFT = (0, 1, 2, 3, 4)  # each level has half the side of the one before
 # Steps of about two in lobe width keep the blend of two levels within 2 % under a broad light.
 EXACT_ROUGHNESS = (0.0, 0.1, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0)
-EXACT_SHIFT = (0, 0, 1, 1, 2, 2, 3, 3)  # a texel is at most half as wide as the level's lobe
+EXACT_SHIFT = (0, 0, 1, 1, 2, 2, 2, 2)  # a texel is at most half as wide as the level's lobe
 EXACT_ACCURACY = (0.7, 0.7, 0.7, 0.35, 0.35, 0.35, 0.35)  # coarse levels are cheap to do well
-SMALLEST_LEVEL = 8
-IRRADIANCE_SIZE = 16  # the cosine lobe damps everything finer
+SMALLEST_LEVEL = 8  # keeps the widest lobe's gradient
+IRRADIANCE_SIZE = 32  # at the map's creases bilinear lookup is off by half a texel's slope
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,15 @@ class PyramidLayout:
         """First texel of each level and of the irradiance map, and the total."""
         counts = [n * n for n in (*self.sizes, self.irradiance_size)]
         return tuple(int(total) for total in np.cumsum([0, *counts]))
+
+    def locate(
+        self, roughness: Float[Tensor, "P 1"]
+    ) -> tuple[Int[Tensor, "P"], Float[Tensor, "P 1"]]:
+        """Level below each roughness and the fraction towards the next, which has a gradient."""
+        knots = roughness.new_tensor(self.roughness)
+        level = torch.bucketize(roughness.detach()[:, 0].contiguous(), knots[1:-1], right=True)
+        lower, upper = knots[level][:, None], knots[level + 1][:, None]
+        return level, ((roughness - lower) / (upper - lower)).clamp(0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -92,10 +101,7 @@ class EnvironmentPyramid:
 
         Bilinear in the map, linear between levels; differentiable in everything.
         """
-        knots = roughness.new_tensor(self.layout.roughness)
-        level = torch.bucketize(roughness.detach()[:, 0].contiguous(), knots[1:-1], right=True)
-        lower, upper = knots[level][:, None], knots[level + 1][:, None]
-        fraction = ((roughness - lower) / (upper - lower)).clamp(0.0, 1.0)
+        level, fraction = self.layout.locate(roughness)
         sharp = self._level_lookup(direction, level)
         return sharp + fraction * (self._level_lookup(direction, level + 1) - sharp)
 

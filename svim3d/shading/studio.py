@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from svim3d.numerics import dot, normalize, smoothstep
+from svim3d.numerics import normalize, smoothstep
 
 FLOOR, CEILING = (0.06, 0.055, 0.05), (0.15, 0.16, 0.18)  # radiance of the room, bottom and top
 EDGE_DEG = 4.0  # half width of a soft box's edge
@@ -29,10 +29,10 @@ def studio_radiance(direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*bat
         # Leaning away from the world's up axis keeps the box upright wherever it hangs.
         right = normalize(torch.linalg.cross(direction.new_tensor([0.0, 1.0, 1e-3]), forward))
         up = torch.linalg.cross(forward, right)
-        depth = dot(direction, forward)
+        depth = (direction @ forward)[..., None]
         inside = (depth > 0.0).to(direction)
         for axis, half_angle in ((right, half_angles[0]), (up, half_angles[1])):
-            angle = torch.atan2(dot(direction, axis).abs(), depth) * (180.0 / math.pi)
+            angle = torch.atan2((direction @ axis)[..., None].abs(), depth) * (180.0 / math.pi)
             inside = inside * smoothstep(0.5 - (angle - half_angle) / (2.0 * EDGE_DEG))
         radiance = radiance + inside * direction.new_tensor(colour)
     return radiance

@@ -9,7 +9,6 @@ import torch
 from sphere_orbit import RADIUS, sphere_cameras, sphere_images
 
 from stages.artifacts import MaterialViews
-from stages.base import Context
 from stages.errors import InputError
 from stages.generation import run
 from stages.settings.generation import GenerationConfig
@@ -23,8 +22,8 @@ TINY = GenerationConfig(views=4, size=32, supersample=2, environment_size=16)
 
 
 @pytest.fixture
-def ctx(tmp_path):
-    with Context("generation", torch.device("cpu"), 0, tmp_path / "work", tmp_path) as context:
+def ctx(make_context):
+    with make_context("generation") as context:
         yield context
 
 

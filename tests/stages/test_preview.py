@@ -5,7 +5,6 @@ import torch
 from sphere_orbit import sphere_cameras, sphere_images
 
 from stages.artifacts import ExportedAsset, FittedField, MaterialViews
-from stages.base import Context
 from stages.preview import INK, PAPER, TEXT_PX, PreviewSheet, run
 from stages.settings.preview import PreviewConfig
 from svim3d.fields.material_field import MaterialFieldSpec
@@ -18,8 +17,8 @@ TINY = PreviewConfig(views=3, cell=64, supersample=4)
 
 
 @pytest.fixture
-def ctx(tmp_path):
-    with Context("preview", torch.device("cpu"), 0, tmp_path / "work", tmp_path) as context:
+def ctx(make_context):
+    with make_context("preview") as context:
         yield context
 
 

@@ -1,6 +1,4 @@
 import json
-import os
-from pathlib import Path
 
 import pytest
 import torch
@@ -83,11 +81,10 @@ def test_a_dropped_reference_is_replaced_by_its_likest_view(cameras, images):
     assert reference == int(likeness.argmax())
 
 
-@pytest.mark.skipif("SVIM3D_DATA" not in os.environ, reason="needs SVIM3D_DATA")
 @pytest.mark.parametrize("split", ["train", "test_A", "test_B"])
-def test_path_traced_orbit_needs_no_repair(split):
+def test_path_traced_orbit_needs_no_repair(data, split):
     told = []
-    folder = Path(os.environ["SVIM3D_DATA"]) / "orbits" / "barrel"
+    folder = data / "orbits" / "barrel"
     cameras, images, reference = read_orbit(folder, split, notify=lambda *e: told.append(e))
     assert not told
     if split == "train":

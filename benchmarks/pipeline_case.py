@@ -1,0 +1,102 @@
+"""One case of the pipeline benchmark, in a process of its own: all stages, then the figures.
+
+The stages run through the real store, without the flow engine: what a stored artifact cost is read
+from its manifest, so that an interrupted benchmark goes on where it stopped and stages that two
+cases share run once.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from evaluate_asset import evaluate
+
+from flows.config import PipelineConfig, load_config
+from flows.pipeline import IMAGE_TO_ASSET, SOURCE
+from flows.plan import Plan, Selection, Verdict, make_plan
+from stages.execution import run_stage
+from stages.store import Store, Stored
+from svim3d.io.exr import read_rgb
+
+LAST_STAGE = "export"  # what the figures are about; the preview sheet is not counted
+
+
+def plan_case(
+    orbit: Path, preset: str, overrides: list[str], skip: list[str], *, store: Store, seed: int
+) -> Plan:
+    """What the case has to compute."""
+    config = load_config(PipelineConfig, preset, overrides, skip)
+    selection = Selection(until=LAST_STAGE)
+    return make_plan(
+        IMAGE_TO_ASSET, config, source=orbit, seed=seed, store=store, selection=selection
+    )
+
+
+def case_key(plan: Plan) -> str:
+    """Key of the asset that the case ends with."""
+    return next(step.recipe.key for step in plan.steps if step.node.name == LAST_STAGE)
+
+
+def run_case(plan: Plan, store: Store) -> dict[str, Stored]:
+    """Artifacts of all stages, computed where the store has none."""
+    done: dict[str, Stored] = {}
+    for step in plan.steps:
+        if step.verdict in (Verdict.SKIPPED, Verdict.NOT_ASKED):
+            continue
+        inputs = {n: plan.source if n == SOURCE else done.get(n) for n in step.node.inputs}
+        name = step.node.name
+        done[name] = run_stage(
+            store,
+            step.recipe,
+            step.node.load(),
+            inputs,
+            config=getattr(plan.config, name),
+            device=torch.device("cpu"),
+        )
+        record = done[name].manifest.record
+        state = "cached" if done[name].is_cached else "computed"
+        print(f"  {name:11s} {record['seconds']:7.1f} s  {state}  {record['headline']}", flush=True)
+    return done
+
+
+def measure(plan: Plan, store: Store) -> dict[str, Any]:
+    """Seconds, memory and quality of one case."""
+    done = run_case(plan, store)
+    records = {name: stored.manifest.record for name, stored in done.items()}
+    phase0 = None
+    if "env_preopt" in done:
+        phase0 = torch.from_numpy(read_rgb(done["env_preopt"].folder / "environment.exr"))
+    figures = evaluate(done[LAST_STAGE].folder / "asset.glb", plan.source, phase0)
+    return {
+        "key": case_key(plan),
+        "seconds": {name: record["seconds"] for name, record in records.items()},
+        "cpu_seconds": {name: record["cpu_seconds"] for name, record in records.items()},
+        "peak_mib": max(record["peak_memory_mib"]["host"] for record in records.values()),
+        "events": {name: record["events"] for name, record in records.items()},
+        "figures": figures,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("orbit", type=Path)
+    parser.add_argument("--preset", required=True)
+    parser.add_argument("--set", action="append", default=[], dest="overrides")
+    parser.add_argument("--skip", action="append", default=[])
+    parser.add_argument("--store", type=Path, required=True)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, required=True, help="JSON file for the result")
+    given = parser.parse_args()
+    store = Store(given.store)
+    plan = plan_case(
+        given.orbit, given.preset, given.overrides, given.skip, store=store, seed=given.seed
+    )
+    result = measure(plan, store)
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    given.out.write_text(json.dumps(result, indent=1))
+
+
+if __name__ == "__main__":
+    main()

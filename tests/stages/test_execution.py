@@ -1,0 +1,95 @@
+"""One stage against the store: inputs loaded, result saved, the making recorded."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import pytest
+import torch
+
+from stages.base import Context, Stage
+from stages.errors import InputError
+from stages.execution import choose_device, run_stage
+from stages.keys import Recipe
+from stages.settings.base import StageConfig
+from stages.store import Store
+
+CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True)
+class Text:
+    value: str
+
+    def save(self, folder: Path) -> None:
+        (folder / "text.txt").write_text(self.value)
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        return cls((folder / "text.txt").read_text())
+
+    def headline(self) -> str:
+        return f"{len(self.value)} letters"
+
+
+def read(source: Path, *, config: StageConfig, ctx: Context) -> Text:
+    return Text(source.read_text())
+
+
+def join(one: Text, two: Text | None, *, config: StageConfig, ctx: Context) -> Text:
+    if two is None:
+        ctx.event("no_second", "joined with nothing")
+    ctx.report(1, 1, {"length": len(one.value)})
+    return Text(one.value + (two.value if two else "-"))
+
+
+def recipe(stage: str) -> Recipe:
+    return Recipe(stage, {}, 3, {}, {}, {})
+
+
+def test_stages_chain_through_the_store(tmp_path):
+    store = Store(tmp_path / "store")
+    (tmp_path / "in.txt").write_text("ab")
+    options = {"config": StageConfig(), "device": CPU}
+    first = run_stage(
+        store, recipe("read"), Stage(read), {"source": tmp_path / "in.txt"}, **options
+    )
+    both = {"one": first, "two": None}
+    second = run_stage(store, recipe("join"), Stage(join), both, **options)
+    assert Text.load(second.folder).value == "ab-"
+    record = second.manifest.record
+    assert record["headline"] == "3 letters"
+    assert record["events"] == [{"kind": "no_second", "message": "joined with nothing"}]
+    assert record["consumed"] == {"one": first.manifest.seal}
+    assert record["seconds"] >= 0 and record["peak_memory_mib"]["host"] > 1
+    assert record["device"] == "cpu" and record["python"]
+    assert (store.artifact(second.key) / "scalars.csv").read_text() == "1,length,2\n"
+    assert run_stage(store, recipe("join"), Stage(join), both, **options).is_cached
+
+
+def test_resumed_stage_says_so(tmp_path):
+    store = Store(tmp_path)
+    work = store.work(recipe("read").key)
+    work.mkdir(parents=True)
+    (work / "checkpoint.safetensors").write_bytes(b"whatever")
+    (tmp_path / "in.txt").write_text("ab")
+    stored = run_stage(
+        store,
+        recipe("read"),
+        Stage(read),
+        {"source": tmp_path / "in.txt"},
+        config=StageConfig(),
+        device=CPU,
+    )
+    assert stored.manifest.record["events"][0]["kind"] == "resumed"
+
+
+def test_device_is_chosen_by_what_there_is():
+    assert choose_device("cpu") == CPU
+    assert choose_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has what the test refuses")
+def test_absent_device_is_refused():
+    with pytest.raises(InputError, match="torch sees none"):
+        choose_device("cuda")
