@@ -11,7 +11,6 @@ import logging
 from dataclasses import dataclass
 
 import torch
-from svim3d.shading.prefilter import PyramidOperator
 from torch import Tensor, nn
 
 from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
@@ -31,10 +30,11 @@ from svim3d.render.march import hits_surface
 from svim3d.render.pixel_blocks import PIXELS, PixelBlocks
 from svim3d.render.volumes import DensityVolume, SdfVolume
 from svim3d.render.volumetric import Rendered, render_rays
-
-SDF, ENVIRONMENT = "volume.", "log_environment"  # names of parameters
+from svim3d.shading.prefilter import PyramidOperator
 
 log = logging.getLogger(__name__)
+
+VOLUME, SDF_GRID, ENVIRONMENT = "volume.", "volume.grid", "log_environment"  # parameter names
 
 MIN_COVERAGE = 1e-3  # guards the division that turns premultiplied into straight
 MIN_VIEWS = 3  # fewer silhouettes leave the hull open along whole directions
@@ -42,6 +42,7 @@ ENVIRONMENT_EPS = 1e-8  # texels that nothing reflects keep the light they start
 HULL_NODES = 128  # fine enough for parts of one pixel, and still computed in half a second
 MIN_RADIANCE = 1e-4  # keeps the logarithm of black texels finite
 SMALLEST_PART = 1e-4  # of the largest part's volume: smaller ones are specks
+MOMENT_POWER = {"exp_avg": 1, "exp_avg_sq": 2}  # how Adam's moments scale with the gradient
 REFRESH_EVERY = 8  # steps between updates of the empty-space grid
 WARM_UP = 10  # steps over which the rates rise, while Adam's moments fill
 CULL_RAYS = 65536  # rays tested at once for meeting the hull
@@ -66,13 +67,13 @@ class _Fit:
         config: NerfConfig,
     ) -> "_Fit":
         """Give every parameter its rate."""
-        named = {f"volume.{n}": p for n, p in volume.named_parameters()}
+        named = {f"{VOLUME}{n}": p for n, p in volume.named_parameters()}
         named |= {f"materials.{n}": p for n, p in materials.named_parameters()}
         named[ENVIRONMENT] = log_environment
         rates = {name: _rate(name, config) for name in named}
         if isinstance(volume, SdfVolume):
             distance = Rate(config.sdf_rate * volume.cell)
-            rates |= {name: distance for name in named if name.startswith(SDF)}
+            rates |= {name: distance for name in named if name.startswith(VOLUME)}
         return cls(volume, materials, log_environment, NamedAdam(named, rates))
 
     def grow(self, nodes: int, config: NerfConfig) -> None:
@@ -84,20 +85,17 @@ class _Fit:
         ratio = (len(self.volume.grid) / nodes) ** 3
         self.volume.resample(nodes, config.coarse_below(nodes))
         rate = Rate(config.sdf_rate * self.volume.cell)
-        fresh = {f"volume.{n}": p for n, p in self.volume.named_parameters()}
-        for name in [n for n in self.adam.parameters if n.startswith(SDF) and n not in fresh]:
+        fresh = {f"{VOLUME}{n}": p for n, p in self.volume.named_parameters()}
+        for name in [n for n in self.adam.parameters if n.startswith(VOLUME) and n not in fresh]:
             self.adam.remove(name)
-        for name in fresh.keys() - {f"{SDF}grid"}:
+        for name in fresh.keys() - {SDF_GRID}:
             self.adam.replace(name, fresh[name], rate)
         self.adam.replace(
-            f"{SDF}grid",
+            SDF_GRID,
             self.volume.grid,
             rate,
             lambda moment, old: resample_grid(old, nodes) * ratio ** MOMENT_POWER[moment],
         )
-
-
-MOMENT_POWER = {"exp_avg": 1, "exp_avg_sq": 2}
 
 
 def _rate(name: str, config: NerfConfig) -> Rate:
@@ -123,10 +121,11 @@ def _image_planes(views: MaterialViews, size: int, device: torch.device) -> dict
 
 
 def _average(images: Tensor, factor: int) -> Tensor:
-    """Mean over factor x factor pixels; rows and columns that do not fill one are cut."""
+    """Mean over about factor x factor pixels; the whole picture stays in view."""
     if factor == 1:
         return images
-    pooled = torch.nn.functional.avg_pool2d(images.permute(0, 3, 1, 2), factor)
+    size = (images.shape[1] // factor, images.shape[2] // factor)
+    pooled = torch.nn.functional.adaptive_avg_pool2d(images.permute(0, 3, 1, 2), size)
     return pooled.permute(0, 2, 3, 1).contiguous()
 
 
@@ -189,25 +188,28 @@ def _pixel_blocks(
     return blocks.take(torch.cat(keep))
 
 
+def _start_volume(hull: Tensor, config: NerfConfig, ctx: Context) -> SdfVolume | DensityVolume:
+    """The density model that was asked for, filling the hull."""
+    if config.density_model == "sdf":
+        surface = SdfVolume(hull, config.half_extent)
+        surface.resample(config.grid_nodes[0], config.coarse_below(config.grid_nodes[0]))
+        return surface
+    spec = HashGridSpec(
+        config.hash_levels, config.hash_log2_entries, config.hash_coarsest, config.hash_finest
+    )
+    fog = DensityVolume(spec, hull, config.half_extent, config.density_threshold)
+    fog.reset(ctx.generator("density"))
+    return fog.to(ctx.device)
+
+
 def _start(
     hull: Tensor, environment: EnvironmentLight | None, config: NerfConfig, ctx: Context
 ) -> _Fit:
     """Parameters and optimiser before the first step."""
-    if config.density_model == "sdf":
-        volume: SdfVolume | DensityVolume = SdfVolume(hull, config.half_extent)
-        volume.resample(config.grid_nodes[0], config.coarse_below(config.grid_nodes[0]))
-    else:
-        volume = DensityVolume(
-            HashGridSpec(config.hash_levels, config.hash_log2_entries, 16, config.hash_finest),
-            hull,
-            config.half_extent,
-            config.density_threshold,
-        )
-        volume.reset(ctx.generator("density"))
     spec = MaterialFieldSpec(
         levels=config.hash_levels,
         log2_entries=config.hash_log2_entries,
-        coarsest=16,
+        coarsest=config.hash_coarsest,
         finest=config.hash_finest,
         hidden=config.hidden,
         half_extent=config.half_extent,
@@ -220,8 +222,8 @@ def _start(
     else:
         radiance = environment.radiance
     log_environment = nn.Parameter(radiance.clamp_min(MIN_RADIANCE).log().to(ctx.device))
-    materials, volume = materials.to(ctx.device), volume.to(ctx.device)
-    return _Fit.assemble(volume, materials, log_environment, config)
+    volume = _start_volume(hull, config, ctx)
+    return _Fit.assemble(volume, materials.to(ctx.device), log_environment, config)
 
 
 def _losses(
@@ -255,6 +257,10 @@ def _losses(
         "depth_smoothness": config.depth_smoothness_weight
         * ray_losses.depth_smoothness_loss(depth, both, batch.footprint),
     }
+    if isinstance(fit.volume, SdfVolume):
+        terms["eikonal"] = config.eikonal_weight * ray_losses.unit_gradient_loss(
+            rendered.surface.gradient
+        )
     if rendered.radiance is not None:
         terms["radiance"] = config.radiance_weight * ray_losses.radiance_loss(
             blocks(rendered.radiance), target["radiance"]
@@ -267,7 +273,7 @@ def _losses(
         terms["bump_normal"] = config.bump_normal_weight * ray_losses.absolute_loss(
             blocks(rendered.normal_shading), target["normal"]
         )
-        terms["bump_size"] = config.bump_size_weight * rendered.bump.square().mean()
+        terms["bump_size"] = config.bump_size_weight * ray_losses.size_loss(rendered.bump)
     return terms
 
 
@@ -298,13 +304,12 @@ def _optimise(fit: _Fit, blocks: PixelBlocks, config: NerfConfig, ctx: Context) 
                 fit.volume.sharpness = config.sharpness_at(step / config.steps)
             fit.volume.refresh(generator=ctx.generator(f"refresh {step}"))
         batch = _draw(blocks, step, config, ctx)
-        draws = torch.rand(batch.pixels.numel(), 3, generator=ctx.generator(f"jitter {step}"))
-        draws = draws.to(ctx.device)
+        jitter = torch.rand(batch.pixels.numel(), generator=ctx.generator(f"jitter {step}"))
         rendered = render_rays(
             fit.volume,
             fit.materials,
-            batch.rays(draws[:, 1:] - 0.5 if config.pixel_jitter else None),
-            jitter=draws[:, 0],
+            batch.rays(),
+            jitter=jitter.to(ctx.device),
             pyramid=operator(fit.log_environment.exp()),
             min_weight=config.min_weight,
             use_bump=step >= config.bump_start * config.steps,
@@ -326,7 +331,7 @@ def _resume(fit: _Fit, config: NerfConfig, ctx: Context) -> int:
     if saved is None:
         return 0
     step, tensors = saved
-    nodes = tensors.get(f"value.{SDF}grid")
+    nodes = tensors.get(f"value.{SDF_GRID}")
     if nodes is not None and isinstance(fit.volume, SdfVolume):
         fit.grow(len(nodes), config)
     fit.adam.load_state(tensors)

@@ -38,19 +38,19 @@ class NerfConfig(StageConfig):
     """Inverse width of the opacity transition at the start, per world unit (NeuS: s)."""
     sharpness_end: PositiveFloat = 1000.0
     """The same at the end; it rises exponentially."""
-    density_threshold: PositiveFloat = 50.0
+    density_threshold: PositiveFloat = 12.0
     """Density of the surface, per world unit (density model only)."""
 
     hash_levels: Annotated[int, Field(ge=1, le=16)] = 8
     """Lattices of the material field's hash grid."""
     hash_log2_entries: Annotated[int, Field(ge=8, le=22)] = 17
     """A level stores at most 2^this nodes."""
+    hash_coarsest: PositiveInt = 16
+    """Cells per side of the coarsest lattice."""
     hash_finest: PositiveInt = 384
     """Cells per side of the finest lattice; about one per pixel of the object."""
     hidden: PositiveInt = 32
     """Width of the material network."""
-    pixel_jitter: bool = True
-    """Rays pass anywhere through their pixel, as light did, instead of through its centre."""
     min_weight: Share = 0.02
     """Samples that contribute less to their ray get no material: they cost more than they teach."""
     bump_start: Share = 0.5

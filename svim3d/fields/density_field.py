@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from svim3d.fields.hash_grid import HashGrid, HashGridSpec
 from svim3d.fields.networks import Perceptron
 
-START_DENSITY = 5.0  # per world unit: the hull starts as a fog that light crosses, so all can move
+START_DENSITY = 25.0  # per world unit: the hull starts opaque behind a skin of some hundredths
 MAX_LOG_DENSITY = 9.0  # density 8100 per unit stops light within a ten-thousandth of the object
 
 

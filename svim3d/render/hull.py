@@ -20,11 +20,12 @@ MAX_REJECTIONS = 7  # length of the kernel's sorted list, less one
 
 @kernel()
 def _coverage(mask: Floats, column: Any, row: Any) -> Any:
-    """Bilinear mask value at continuous pixel coordinates; 1 (no evidence) beyond the image."""
+    """Bilinear mask value at continuous pixel coordinates.
+
+    Beyond the image it continues as at its border: empty, or full where the object is cut off.
+    """
     height, width = mask.shape
     one = np.float32(1.0)
-    if column < 0.0 or row < 0.0 or column > width or row > height:
-        return one
     x = min(max(column - np.float32(0.5), np.float32(0.0)), np.float32(width - 1))
     y = min(max(row - np.float32(0.5), np.float32(0.0)), np.float32(height - 1))
     left, top = min(int(x), width - 2), min(int(y), height - 2)
@@ -83,8 +84,7 @@ def coverage_votes_reference(
         value = torch.nn.functional.grid_sample(
             mask[None, None], grid[None, None], padding_mode="border", align_corners=False
         ).view(-1)
-        no_evidence = (ndc.abs() > 1.0).any(-1) | (clip[:, 3] <= 0.0)
-        value = value.masked_fill(no_evidence, 1.0)
+        value = value.masked_fill(clip[:, 3] <= 0.0, 1.0)  # behind: no evidence
         kept = torch.cat([kept, value[None]]).sort(0).values[: rejections + 1]
     return kept[rejections].view(nodes, nodes, nodes)
 

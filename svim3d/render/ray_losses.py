@@ -60,9 +60,19 @@ def squared_loss(
     return (rendered - target).square().mean()
 
 
-def unit_gradient_loss(gradient: Float[Tensor, "*batch 3"]) -> Float[Tensor, ""]:
+def unit_gradient_loss(gradient: Float[Tensor, "N 3"]) -> Float[Tensor, ""]:
     """Eikonal term: a signed distance has |gradient| = 1. Source: Gropp et al. 2020, eq. 2."""
-    return (length(gradient) - 1.0).square().mean() if len(gradient) else gradient.sum()
+    return _mean_or_zero((length(gradient) - 1.0).square())
+
+
+def size_loss(vectors: Float[Tensor, "N C"]) -> Float[Tensor, ""]:
+    """Mean square of all components."""
+    return _mean_or_zero(vectors.square())
+
+
+def _mean_or_zero(values: Float[Tensor, "N C"]) -> Float[Tensor, ""]:
+    """The mean over samples, of which a batch may have none."""
+    return values.mean() if len(values) else values.sum()
 
 
 def _neighbours(values: Float[Tensor, "B 4 C"]) -> tuple[Tensor, Tensor]:

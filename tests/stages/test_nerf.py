@@ -1,4 +1,4 @@
-"""Phase 1 through `run`: a painted sphere is found again, exactly repeatably; bad input is named."""
+"""Phase 1 through `run`: a painted sphere is found, repeatably to the bit; bad input is named."""
 
 import dataclasses
 
@@ -58,9 +58,9 @@ def basecolor_error(fitted):
 
 def test_sphere_is_found_with_its_paint_and_a_light(views, make_context):
     fitted = run(views, None, config=TINY, ctx=make_context("nerf"))
-    # A pixel is 0.028 wide here.
-    assert surface_error(fitted) < 0.006
-    assert basecolor_error(fitted) < 0.05
+    # A fifth of a pixel.
+    assert surface_error(fitted) < 0.005
+    assert basecolor_error(fitted) < 0.08
     assert fitted.sdf.shape == (32, 32, 32)
     assert fitted.environment.shape == (16, 16, 3)
     assert bool((fitted.environment > 0).all())
@@ -70,12 +70,15 @@ def test_sphere_is_found_with_its_paint_and_a_light(views, make_context):
 def test_density_model_finds_it_too(views, make_context):
     config = TINY.model_copy(update={"density_model": "density", "steps": 100})
     fitted = run(views, None, config=config, ctx=make_context("nerf"))
-    assert surface_error(fitted) < 0.03
-    assert basecolor_error(fitted) < 0.08
+    # About a pixel: a fog has no sharp surface.
+    assert surface_error(fitted) < 0.04
+    assert basecolor_error(fitted) < 0.12
 
 
 def test_given_light_is_the_start_and_a_rate_of_zero_keeps_it(views, make_context):
-    light = EnvironmentLight(torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0)) + 0.1)
+    light = EnvironmentLight(
+        torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0)) + 0.1
+    )
     config = TINY.model_copy(update={"steps": 4, "environment_rate": 0.0})
     fitted = run(views, light, config=config, ctx=make_context("nerf"))
     torch.testing.assert_close(fitted.environment, light.radiance)
@@ -114,9 +117,7 @@ def test_killed_and_resumed_run_ends_with_equal_bytes(views, make_context, tmp_p
 
 
 def test_artifact_survives_the_disk(views, make_context, tmp_path):
-    fitted = run(
-        views, None, config=TINY.model_copy(update={"steps": 2}), ctx=make_context("nerf")
-    )
+    fitted = run(views, None, config=TINY.model_copy(update={"steps": 2}), ctx=make_context("nerf"))
     fitted.save(tmp_path)
     again = FittedField.load(tmp_path)
     assert equal(fitted, again)
@@ -138,7 +139,7 @@ def only(views, chosen):
 
 
 def test_one_view_is_refused_with_advice(views, make_context):
-    with pytest.raises(InputError, match="at least 3 views .* got 1; give an orbit"):
+    with pytest.raises(InputError, match=r"at least 3 views .* got 1; give an orbit"):
         run(only(views, [0]), None, config=TINY, ctx=make_context("nerf"))
 
 

@@ -61,7 +61,7 @@ def test_rejections_outvote_wrong_masks(orbit):
     assert bool(outvoted[votes(masks, matrices) >= 0.5].all())
 
 
-def test_points_outside_a_picture_are_not_held_against_the_object(orbit):
+def test_object_cut_off_by_a_picture_goes_on_beyond_its_border(orbit):
     masks, matrices = orbit
     cropped = matrices.clone()
     cropped[0, :2] *= 4.0  # a close-up sees the middle only

@@ -1,4 +1,4 @@
-"""Pixel blocks: neighbours together, targets with their rays, offsets that stay in the pixel."""
+"""Pixel blocks: neighbours together, targets with their rays."""
 
 import torch
 
@@ -36,16 +36,6 @@ def test_rays_are_those_of_the_cameras():
         origins, directions = cameras.rays(pixel // 36)
         torch.testing.assert_close(rays.origins[place], origins[pixel % 36])
         torch.testing.assert_close(rays.directions[place], directions[pixel % 36])
-
-
-def test_offset_of_one_pixel_is_the_neighbours_ray():
-    _, blocks = make_blocks()
-    centre = blocks.rays().directions.view(-1, 4, 3)
-    count = blocks.pixels.numel()
-    right = blocks.rays(torch.tensor([[1.0, 0.0]]).expand(count, 2)).directions.view(-1, 4, 3)
-    down = blocks.rays(torch.tensor([[0.0, 1.0]]).expand(count, 2)).directions.view(-1, 4, 3)
-    torch.testing.assert_close(right[:, 0], centre[:, 1])
-    torch.testing.assert_close(down[:, 1], centre[:, 3])
 
 
 def test_footprint_is_a_pixel_at_the_origin():
