@@ -251,7 +251,6 @@ def _losses(
             torch.cat([target["roughness"], target["metallic"]], -1),
         ),
         "normal": normal_weight * ray_losses.absolute_loss(normal, target["normal"]),
-        "eikonal": config.eikonal_weight * ray_losses.unit_gradient_loss(rendered.surface.gradient),
         "normal_smoothness": config.normal_smoothness_weight
         * ray_losses.bilateral_loss(straight, target["guide"], both),
         "depth_smoothness": config.depth_smoothness_weight
@@ -290,14 +289,9 @@ def _optimise(fit: _Fit, blocks: PixelBlocks, config: NerfConfig, ctx: Context) 
     """The loop. State is saved where the empty-space grid is a function of the parameters."""
     operator = PyramidOperator.build(len(fit.log_environment))
     first = _resume(fit, config, ctx)
-    growth = {
-        round(share * config.steps): nodes
-        for share, nodes in zip(config.grid_shares, config.grid_nodes, strict=True)
-    }
     for step in range(first, config.steps):
-        if step in growth and isinstance(fit.volume, SdfVolume) and step > first:
-            fit.grow(growth[step], config)
         if step % REFRESH_EVERY == 0:
+            _grow_if_due(fit, step, config)
             if ctx.checkpoints.due():
                 ctx.checkpoints.save(step, fit.adam.state() | dict(fit.volume.named_buffers()))
             if isinstance(fit.volume, SdfVolume):
@@ -323,6 +317,16 @@ def _optimise(fit: _Fit, blocks: PixelBlocks, config: NerfConfig, ctx: Context) 
                 config.final_rate ** (step / config.steps) * min(1.0, (step + 1) / WARM_UP)
             )
         ctx.report(step + 1, config.steps, {name: float(t.detach()) for name, t in terms.items()})
+
+
+def _grow_if_due(fit: _Fit, step: int, config: NerfConfig) -> None:
+    """Go to the next grid of the schedule at the first refresh at or after its share of steps."""
+    if not isinstance(fit.volume, SdfVolume):
+        return
+    begun = [share * config.steps <= step for share in config.grid_shares]
+    nodes = config.grid_nodes[sum(begun) - 1]
+    if nodes != len(fit.volume.grid):
+        fit.grow(nodes, config)
 
 
 def _resume(fit: _Fit, config: NerfConfig, ctx: Context) -> int:

@@ -56,7 +56,7 @@ class NerfConfig(StageConfig):
     bump_start: Share = 0.5
     """Share of the steps after which the bump normal is fitted (paper: one half)."""
 
-    environment_size: Annotated[int, Field(ge=16, multiple_of=16)] = 64
+    environment_size: Literal[16, 32, 64, 128, 256] = 64
     """Side of the octahedral map when phase 0 was skipped, texels."""
     environment_start: PositiveFloat = 0.5
     """Radiance of the flat light when phase 0 was skipped."""
