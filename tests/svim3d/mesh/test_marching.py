@@ -79,7 +79,7 @@ def test_a_plane_is_exact_and_the_box_it_cuts_is_closed():
     inner = (vertices.abs() < HALF - 0.5 * cell).all(1)
     assert int(inner.sum()) > 100
     assert float((vertices[inner] @ normal - 0.1).abs().max()) < 1e-6
-    within = HALF + 0.5 * cell
+    within = HALF + cell
     assert float(vertices.abs().max()) <= within + 1e-6
 
 
