@@ -91,7 +91,8 @@ def run(asset: str, point: str, given: argparse.Namespace) -> dict[str, Any] | N
     is_preset = point in PRESETS
     preset = point if is_preset else STEPPED
     overrides = [*given.overrides, *([] if is_preset else step_overrides(int(point)))]
-    plan = plan_case(orbit, preset, overrides, Store(given.store), given.seed)
+    store = Store(given.store)
+    plan = plan_case(orbit, preset, overrides, given.skip, store=store, seed=given.seed)
     file = given.results / f"{asset}-{point}.json"
     if file.exists():
         result = json.loads(file.read_text())
@@ -101,6 +102,7 @@ def run(asset: str, point: str, given: argparse.Namespace) -> dict[str, Any] | N
     command = [sys.executable, str(Path(__file__).with_name("pipeline_case.py")), str(orbit)]
     command += ["--preset", preset, "--store", str(given.store), "--out", str(file)]
     command += ["--seed", str(given.seed), *(f"--set={override}" for override in overrides)]
+    command += [f"--skip={name}" for name in given.skip]
     path = f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
     # Idle pools that spin take the cores from those that work.
     environment = {"GOMP_SPINCOUNT": "0"} | os.environ | {"PYTHONPATH": path}
@@ -195,13 +197,14 @@ def main() -> None:
     parser.add_argument("--presets", nargs="*", default=PRESETS, choices=PRESETS)
     parser.add_argument("--steps", nargs="*", type=int, default=STEPS, help="phase 1 step counts")
     parser.add_argument("--set", action="append", default=[], dest="overrides")
+    parser.add_argument("--skip", action="append", default=[], help="a stage to leave out")
     parser.add_argument("--seed", type=int, default=0)
-    results = ROOT / "benchmarks" / "results"
-    parser.add_argument("--results", type=Path, default=results)
-    parser.add_argument("--store", type=Path, default=results / "store")
+    parser.add_argument("--results", type=Path, default=ROOT / "benchmarks" / "results")
+    parser.add_argument("--store", type=Path, help="of artifacts; default: store in the results")
     parser.add_argument("--keep", action="store_true", help="keep results of other code as well")
     given = parser.parse_args()
     given.data = Path(given.data)
+    given.store = given.store or given.results / "store"
     given.results.mkdir(parents=True, exist_ok=True)
     rows = []
     # Point by point over all assets: the first rows already compare assets.

@@ -23,9 +23,11 @@ from svim3d.io.exr import read_rgb
 LAST_STAGE = "export"  # what the figures are about; the preview sheet is not counted
 
 
-def plan_case(orbit: Path, preset: str, overrides: list[str], store: Store, seed: int) -> Plan:
+def plan_case(
+    orbit: Path, preset: str, overrides: list[str], skip: list[str], *, store: Store, seed: int
+) -> Plan:
     """What the case has to compute."""
-    config = load_config(PipelineConfig, preset, overrides)
+    config = load_config(PipelineConfig, preset, overrides, skip)
     selection = Selection(until=LAST_STAGE)
     return make_plan(
         IMAGE_TO_ASSET, config, source=orbit, seed=seed, store=store, selection=selection
@@ -82,12 +84,15 @@ def main() -> None:
     parser.add_argument("orbit", type=Path)
     parser.add_argument("--preset", required=True)
     parser.add_argument("--set", action="append", default=[], dest="overrides")
+    parser.add_argument("--skip", action="append", default=[])
     parser.add_argument("--store", type=Path, required=True)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True, help="JSON file for the result")
     given = parser.parse_args()
     store = Store(given.store)
-    plan = plan_case(given.orbit, given.preset, given.overrides, store, given.seed)
+    plan = plan_case(
+        given.orbit, given.preset, given.overrides, given.skip, store=store, seed=given.seed
+    )
     result = measure(plan, store)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_text(json.dumps(result, indent=1))

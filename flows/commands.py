@@ -1,7 +1,6 @@
 """What the commands do: plan a run, run it, show the presets."""
 
 import importlib.resources
-import logging
 import signal
 import time
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from flows.config import PRESETS, PipelineConfig, load_config, preset_about
-from flows.console import ConsoleHandler, RunDisplay, plan_table, result_table
+from flows.console import RunDisplay, plan_table, result_table, stage_warnings_on
 from flows.engine import Engine
 from flows.pipeline import IMAGE_TO_ASSET
 from flows.plan import Plan, Selection, Verdict, make_plan
@@ -83,7 +82,6 @@ def run(request: Request) -> int:
     console = Console()
     # A stop by the system must leave the same resumable state as Ctrl-C.
     signal.signal(signal.SIGTERM, _interrupt)
-    logging.getLogger("stages").addHandler(ConsoleHandler(console))
     store = Store(
         request.store, say=lambda text: console.print(text, style="yellow", highlight=False)
     )
@@ -142,7 +140,7 @@ def _compute(
         for step in plan.to_compute:
             step.node.load()
         engine.wait()
-        with RunDisplay(console) as display:
+        with stage_warnings_on(console), RunDisplay(console) as display:
             return run_plan(Bench(plan, store, device, display)), engine.waited_s
 
 

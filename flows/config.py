@@ -16,6 +16,7 @@ from stages.settings.env_preopt import EnvPreoptConfig
 from stages.settings.export import ExportConfig
 from stages.settings.generation import GenerationConfig
 from stages.settings.nerf import NerfConfig
+from stages.settings.preview import PreviewConfig
 from stages.settings.uv_bake import UvBakeConfig
 
 PRESETS = ("preview", "standard", "paper")  # from quick to thorough
@@ -40,6 +41,7 @@ class PipelineConfig(RunConfig):
     dmtet: DmtetConfig = DmtetConfig()
     uv_bake: UvBakeConfig = UvBakeConfig()
     export: ExportConfig = ExportConfig()
+    preview: PreviewConfig = PreviewConfig()
 
 
 ConfigT = TypeVar("ConfigT", bound=RunConfig)

@@ -1,7 +1,8 @@
 """What a person sees of a run: progress with time left, warnings, and the closing table."""
 
+import contextlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -90,16 +91,27 @@ class RunDisplay:
             self._console.print(f"{step.node.name}: {how}, {headline}", highlight=False)
 
 
-class ConsoleHandler(logging.Handler):
-    """Prints warnings of stages above the bars instead of through them."""
-
+class _ConsoleHandler(logging.Handler):
     def __init__(self, console: Console) -> None:
         super().__init__(logging.WARNING)
         self._console = console
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print one record."""
         self._console.print(self.format(record), style="yellow", highlight=False)
+
+
+@contextlib.contextmanager
+def stage_warnings_on(console: Console) -> Iterator[None]:
+    """Print what stages warn of above the bars, and nowhere else."""
+    logger = logging.getLogger("stages")
+    handler = _ConsoleHandler(console)
+    logger.addHandler(handler)
+    logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = True
 
 
 def plan_table(plan: Plan) -> Table:

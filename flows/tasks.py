@@ -128,4 +128,6 @@ def run_step(
         retries=len(retry_delays_s),
         retry_delay_seconds=list(retry_delays_s),
     )
-    return cast(Stored, stage_task(step, upstream, bench))
+    # A task that returns a state is handed that state; its result is what the next step needs.
+    state = stage_task(step, upstream, bench, return_state=True)
+    return cast(Stored, state.result())

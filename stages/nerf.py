@@ -237,7 +237,7 @@ def _losses(
         "basecolor": config.basecolor_weight
         * ray_losses.color_loss(blocks(rendered.basecolor), target["basecolor"]),
         "orm": config.orm_weight
-        * ray_losses.absolute_loss(
+        * ray_losses.squared_loss(
             torch.cat([blocks(rendered.roughness), blocks(rendered.metallic)], -1),
             torch.cat([target["roughness"], target["metallic"]], -1),
         ),
@@ -298,6 +298,7 @@ def _optimise(fit: _Fit, blocks: PixelBlocks, config: NerfConfig, ctx: Context) 
             batch.rays(),
             jitter=jitter.to(ctx.device),
             pyramid=operator(fit.log_environment.exp()),
+            min_weight=config.min_weight,
             use_bump=step >= config.bump_start * config.steps,
             multiple_scattering=config.multiple_scattering,
         )

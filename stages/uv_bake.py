@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.artifacts import FittedField, MaterialViews, RefinedSurface, TexturedMesh
+from stages.artifacts import FittedField, RefinedSurface, TexturedMesh
 from stages.base import Context, Stage
 from stages.errors import InputError
 from stages.settings.uv_bake import UvBakeConfig
@@ -27,7 +27,6 @@ POINTS_PER_CHUNK = 2**17  # bounds the memory of the field's intermediate values
 
 
 def run(
-    views: MaterialViews,
     field: FittedField,
     surface: RefinedSurface | None,
     *,

@@ -11,10 +11,10 @@ class ExportConfig(StageConfig):
     """The finished files."""
 
     formats: tuple[Literal["glb", "obj"], ...] = Field(
-        ("glb",), description="file formats; glb is always among them"
+        default=("glb",), description="file formats; glb is always among them"
     )
     vertex_color_faces: int = Field(
-        100_000,
+        default=100_000,
         ge=100,
         le=2_000_000,
         description="decimate to this when phase 3 was skipped and vertices carry the colour",

@@ -43,6 +43,8 @@ class NerfConfig(StageConfig):
     """Cells per side of the finest lattice; about one per pixel of the object."""
     hidden: PositiveInt = 32
     """Width of the material network."""
+    min_weight: Share = 0.02
+    """Samples that contribute less to their ray get no material: they cost more than they teach."""
     bump_start: Share = 0.5
     """Share of the steps after which the bump normal is fitted (paper: one half)."""
 
@@ -66,9 +68,9 @@ class NerfConfig(StageConfig):
 
     mask_weight: NonNegativeFloat = 0.3
     """Cross-entropy of coverage."""
-    basecolor_weight: NonNegativeFloat = 1.0
+    basecolor_weight: NonNegativeFloat = 3.0
     """Absolute difference in sRGB."""
-    orm_weight: NonNegativeFloat = 0.5
+    orm_weight: NonNegativeFloat = 1.5
     """Absolute difference of roughness and metallic."""
     normal_weight: NonNegativeFloat = 1.0
     """Absolute difference of geometric normals at the start."""

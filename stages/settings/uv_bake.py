@@ -8,28 +8,39 @@ from stages.settings.base import StageConfig
 class UvBakeConfig(StageConfig):
     """Phase 3: from a fitted surface to a mesh of few faces with textures."""
 
-    texture_size: int = Field(1024, ge=16, le=8192, description="texels per side")
+    texture_size: int = Field(default=1024, ge=16, le=8192, description="texels per side")
     supersample: int = Field(
-        1, ge=1, le=4, description="bake at this multiple of the size and average"
+        default=1, ge=1, le=4, description="bake at this multiple of the size and average"
     )
     max_faces: int = Field(
-        16_000,
+        default=16_000,
         ge=100,
         le=100_000,
         description="decimate to this; xatlas takes 0.5 s for 10k, 6 s for 20k rough faces",
     )
     min_area_share: float = Field(
-        0.002, ge=0.0, le=1.0, description="parts below, and below min_extent_share, are floaters"
+        default=0.002,
+        ge=0.0,
+        le=1.0,
+        description="parts below, and below min_extent_share, are floaters",
     )
     min_extent_share: float = Field(
-        0.05, ge=0.0, le=1.0, description="longest side of a part, of the object's; keeps thin rods"
+        default=0.05,
+        ge=0.0,
+        le=1.0,
+        description="longest side of a part, of the object's; keeps thin rods",
     )
     atlas_timeout_s: float = Field(
-        60.0, ge=0.0, description="seconds for xatlas before boxes take over; 0: boxes at once"
+        default=60.0,
+        ge=0.0,
+        description="seconds for xatlas before boxes take over; 0: boxes at once",
     )
     gutter_px: int = Field(
-        4, ge=0, le=64, description="least distance of charts; 4 keeps two mip levels apart"
+        default=4, ge=0, le=64, description="least distance of charts; 4 keeps two mip levels apart"
     )
     occlusion_rays: int = Field(
-        64, ge=0, le=4096, description="rays per vertex for the occlusion channel; 0: none baked"
+        default=64,
+        ge=0,
+        le=4096,
+        description="rays per vertex for the occlusion channel; 0: none baked",
     )

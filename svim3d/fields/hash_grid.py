@@ -105,29 +105,39 @@ def _cell(x: Any, resolution: int) -> tuple[int, Any]:
 
 @kernel(parallel=True)
 def _encode_kernel(
-    points: Floats, table: Floats, resolution: Ints, offset: Ints, mask: Ints, out: Floats
+    points: Floats,
+    table: Floats,
+    resolution: Ints,
+    offset: Ints,
+    mask: Ints,
+    order: Ints,
+    out: Floats,
 ) -> None:
-    """Features of each point; parallel over blocks of points."""
+    """Features of each point. A task is one level of one block of points.
+
+    Neighbouring tasks share a level, so that its part of the table stays in a core's cache.
+    """
     count = points.shape[0]
+    blocks = (count + POINTS_PER_TASK - 1) // POINTS_PER_TASK
     one = np.float32(1.0)
-    for task in prange((count + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
-        for level in range(resolution.shape[0]):
-            r, base, hash_mask = resolution[level], offset[level], mask[level]
-            for i in range(task * POINTS_PER_TASK, min(count, (task + 1) * POINTS_PER_TASK)):
-                ix, x = _cell(points[i, 0], r)
-                iy, y = _cell(points[i, 1], r)
-                iz, z = _cell(points[i, 2], r)
-                first = np.float32(0.0)
-                second = np.float32(0.0)
-                for corner in range(8):
-                    dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
-                    weight = (x if dx else one - x) * (y if dy else one - y)
-                    weight *= z if dz else one - z
-                    row = base + _node(ix + dx, iy + dy, iz + dz, r, hash_mask)
-                    first += weight * table[row, 0]
-                    second += weight * table[row, 1]
-                out[i, 2 * level] = first
-                out[i, 2 * level + 1] = second
+    for task in prange(order.shape[0] * blocks):
+        level, block = order[task // blocks], task % blocks
+        r, base, hash_mask = resolution[level], offset[level], mask[level]
+        for i in range(block * POINTS_PER_TASK, min(count, (block + 1) * POINTS_PER_TASK)):
+            ix, x = _cell(points[i, 0], r)
+            iy, y = _cell(points[i, 1], r)
+            iz, z = _cell(points[i, 2], r)
+            first = np.float32(0.0)
+            second = np.float32(0.0)
+            for corner in range(8):
+                dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
+                weight = (x if dx else one - x) * (y if dy else one - y)
+                weight *= z if dz else one - z
+                row = base + _node(ix + dx, iy + dy, iz + dz, r, hash_mask)
+                first += weight * table[row, 0]
+                second += weight * table[row, 1]
+            out[i, 2 * level] = first
+            out[i, 2 * level + 1] = second
 
 
 @kernel(parallel=True)
@@ -192,6 +202,7 @@ class _Encode(torch.autograd.Function):
             layout.resolution,
             layout.offset,
             layout.mask,
+            layout.order,
             out.numpy(),
         )
         ctx.save_for_backward(points, table)

@@ -1,6 +1,7 @@
 """Materials as a function of position: hash grid, one small network, ranges."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -12,6 +13,7 @@ from svim3d.fields.networks import Perceptron
 
 OUTPUTS = 8  # basecolor 3, roughness, metallic, bump 3
 FIRST_BUMP_OUTPUT = 5
+START_VALUE = 0.5  # all ranged outputs begin near the middle of their range
 
 
 @dataclass(frozen=True)
@@ -57,11 +59,29 @@ class Materials:
     bump: Float[Tensor, "N 3"]
 
 
+class _ClampInward(torch.autograd.Function):
+    """Clamp to [0, 1] whose gradient vanishes only where it would lead further out."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return x.clamp(0.0, 1.0)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (x,) = ctx.saved_tensors
+        # A step goes against the gradient.
+        outward = ((x < 0.0) & (grad > 0.0)) | ((x > 1.0) & (grad < 0.0))
+        return grad.masked_fill(outward, 0.0)
+
+
 class MaterialField(nn.Module):
     """Position in the world to material.
 
     The network speaks sRGB for the basecolor: equal steps of its output are about equally visible,
-    so dark materials are fitted as well as bright ones.
+    so dark materials are fitted as well as bright ones. Ranges are imposed by a clamp, not by a
+    sigmoid: most metallic values are exactly 0 or 1, where a sigmoid has no gradient left to learn
+    that a small part differs.
     """
 
     def __init__(self, spec: MaterialFieldSpec) -> None:
@@ -81,7 +101,7 @@ class MaterialField(nn.Module):
         """Materials at world positions; positions outside the cube take its border's material."""
         unit = points / (2.0 * self.spec.half_extent) + 0.5
         raw = self.network(self.encoding(unit))
-        ranged = torch.sigmoid(raw[:, :FIRST_BUMP_OUTPUT])
+        ranged: Tensor = _ClampInward.apply(START_VALUE + raw[:, :FIRST_BUMP_OUTPUT])  # type: ignore[no-untyped-call]
         return Materials(
             basecolor=linear_from_srgb(ranged[:, :3]),
             roughness=ranged[:, 3:4],

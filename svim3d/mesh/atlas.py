@@ -26,6 +26,7 @@ from svim3d.numerics import dot, normalize
 
 MIN_PROJECTED = 0.25  # cosine below which a face would be drawn too narrow in its neighbours' chart
 SPLIT_ROUNDS = 4  # times that faces on top of others stay together before each is cut off alone
+CHART_TEXELS = 1024  # least resolution for xatlas, which stretches charts to whole texels
 BISECTIONS = 24  # of the texture's scale; the last halves it to 1e-7
 FILL_TARGET = 1.2  # scale at which charts of perfect fit would overfill the texture: upper bound
 
@@ -100,7 +101,7 @@ def unwrap_charts(
         subprocess.CalledProcessError: it crashed.
         ValueError: its result is unusable.
     """
-    header = np.array([len(vertices), len(faces), texture_size], "<i4")
+    header = np.array([len(vertices), len(faces), max(texture_size, CHART_TEXELS)], "<i4")
     mesh = vertices.detach().cpu().numpy().astype("<f4"), faces.cpu().numpy().astype("<u4")
     # By file name: the child needs no package path and none of this process's imports.
     content = subprocess.run(

@@ -26,8 +26,8 @@ def tonemap(radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
 def color_loss(
     rendered_linear: Float[Tensor, "*batch 3"], target_linear: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, ""]:
-    """Mean absolute difference of sRGB-encoded colours."""
-    return (srgb_from_linear(rendered_linear) - srgb_from_linear(target_linear)).abs().mean()
+    """Mean squared difference of sRGB-encoded colours."""
+    return (srgb_from_linear(rendered_linear) - srgb_from_linear(target_linear)).square().mean()
 
 
 def radiance_loss(
@@ -51,6 +51,13 @@ def absolute_loss(
 ) -> Float[Tensor, ""]:
     """Mean absolute difference, for normals and for values in [0, 1]."""
     return (rendered - target).abs().mean()
+
+
+def squared_loss(
+    rendered: Float[Tensor, "*batch C"], target: Float[Tensor, "*batch C"]
+) -> Float[Tensor, ""]:
+    """Mean squared difference, for values in [0, 1]."""
+    return (rendered - target).square().mean()
 
 
 def unit_gradient_loss(gradient: Float[Tensor, "*batch 3"]) -> Float[Tensor, ""]:

@@ -16,7 +16,7 @@ from svim3d.shading.split_sum import shade
 
 MIN_LIT_COVERAGE = 0.05  # fainter rays are not shaded: their composited normal is mostly noise
 SHADING_NORMAL = slice(8, 11)  # columns of the composited values
-MIN_WEIGHT = 4e-3  # samples below contribute less than one 8-bit step and get no material
+MIN_COVERAGE = 1e-3  # guards the division by the weight of a ray's kept samples
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ def render_rays(
     *,
     jitter: Float[Tensor, "R"],
     pyramid: EnvironmentPyramid | None,
+    min_weight: float,
     use_bump: bool = True,
     multiple_scattering: bool = True,
 ) -> Rendered:
@@ -70,10 +71,11 @@ def render_rays(
         rays: world-space rays.
         jitter: offset of each ray's first sample in [0, 1) steps.
         pyramid: the light; None leaves `radiance` out.
+        min_weight: samples that contribute less to their ray get no material of their own.
         use_bump: add the material field's bump to the geometric normal.
         multiple_scattering: compensate the energy that single scattering loses.
     """
-    surface = volume.trace(rays, jitter, MIN_WEIGHT)
+    surface = volume.trace(rays, jitter, min_weight)
     samples, weights = surface.samples, surface.weights
     material = materials(samples.points)
     normal = normalize(-surface.gradient)
@@ -86,7 +88,10 @@ def render_rays(
         shading_normal,
         samples.distance,
     ]
-    composited = accumulate(weights, torch.cat(values, -1), samples)
+    # The light samples left out are taken to look like those kept on their ray.
+    kept = accumulate(weights, torch.ones_like(weights), samples)
+    scale = surface.coverage / kept.clamp_min(MIN_COVERAGE)
+    composited = accumulate(weights, torch.cat(values, -1), samples) * scale
     basecolor, roughness, metallic, geometric, shading, depth = composited.split(
         [value.shape[-1] for value in values], -1
     )

@@ -99,6 +99,15 @@ def sample_octahedral(
     return (texels.view(-1, 4, channels) * weights[..., None]).sum(1)
 
 
+def total_variation(values: Float[Tensor, "n n c"]) -> Float[Tensor, ""]:
+    """Mean absolute difference of texels that touch on the sphere, seams included."""
+    inner = [values[1:] - values[:-1], values[:, 1:] - values[:, :-1]]
+    # Along each edge of the square, a texel touches its mirror image in the edge's middle.
+    edges = torch.stack([values[0], values[-1], values[:, 0], values[:, -1]])
+    seams = [edges - edges.flip(1)]
+    return torch.cat([d.abs().reshape(-1) for d in inner + seams]).mean()
+
+
 def _texel_centres(n: int, like: Tensor | None) -> Float[Tensor, "n"]:
     """Coordinates of the n texel centres along one side, in [-1, 1]."""
     axis = (torch.arange(n, dtype=torch.float64) * 2.0 + 1.0) / n - 1.0

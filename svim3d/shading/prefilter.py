@@ -19,7 +19,7 @@ from typing import Literal, Self
 import numpy as np
 import scipy.sparse
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from svim3d.shading.linear_operator import SparseOperator
@@ -66,6 +66,15 @@ class PyramidLayout:
         counts = [n * n for n in (*self.sizes, self.irradiance_size)]
         return tuple(int(total) for total in np.cumsum([0, *counts]))
 
+    def locate(
+        self, roughness: Float[Tensor, "P 1"]
+    ) -> tuple[Int[Tensor, "P"], Float[Tensor, "P 1"]]:
+        """Level below each roughness and the fraction towards the next, which has a gradient."""
+        knots = roughness.new_tensor(self.roughness)
+        level = torch.bucketize(roughness.detach()[:, 0].contiguous(), knots[1:-1], right=True)
+        lower, upper = knots[level][:, None], knots[level + 1][:, None]
+        return level, ((roughness - lower) / (upper - lower)).clamp(0.0, 1.0)
+
 
 @dataclass(frozen=True)
 class EnvironmentPyramid:
@@ -92,10 +101,7 @@ class EnvironmentPyramid:
 
         Bilinear in the map, linear between levels; differentiable in everything.
         """
-        knots = roughness.new_tensor(self.layout.roughness)
-        level = torch.bucketize(roughness.detach()[:, 0].contiguous(), knots[1:-1], right=True)
-        lower, upper = knots[level][:, None], knots[level + 1][:, None]
-        fraction = ((roughness - lower) / (upper - lower)).clamp(0.0, 1.0)
+        level, fraction = self.layout.locate(roughness)
         sharp = self._level_lookup(direction, level)
         return sharp + fraction * (self._level_lookup(direction, level + 1) - sharp)
 

@@ -170,10 +170,10 @@ def test_command_computes_then_answers_from_the_store(engine, store, source, tmp
     command = ["run", str(source), "-o", str(tmp_path / "out"), "--store", str(store.root)]
     assert tiny_command.main(command) == cli.DONE
     printed = capsys.readouterr().out
-    assert printed.count("computed") == 3 and "waiting for the engine" in printed
+    assert printed.count(" computed ") == 3 and "waiting for the engine" in printed
     assert "engine_startup_s" in json.loads((tmp_path / "out" / "run.json").read_text())
     assert tiny_command.main(command) == cli.DONE
-    assert capsys.readouterr().out.count("cached") == 3
+    assert capsys.readouterr().out.count(" cached ") == 3
 
 
 @pytest.mark.parametrize(
