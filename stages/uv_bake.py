@@ -2,8 +2,8 @@
 
 Reads the surface of phase 2 (or phase 1's own when that was skipped) and the material field, writes
 a `TexturedMesh`. Every texel is projected back onto the original surface, where the field is asked
-and the normal is taken; so decimation costs neither colour nor relief. Method: SViM3D sec. 3.4;
-tangent frames: MikkTSpace; xatlas with a time limit, box projection beyond it.
+and the normal is taken; so decimation costs little colour and relief. Tangent frames: MikkTSpace;
+atlas: xatlas with a time limit, box projection beyond it.
 """
 
 import torch

@@ -21,7 +21,7 @@ def alpha_from_roughness(roughness: Float[Tensor, "*batch 1"]) -> Float[Tensor, 
 
 
 def distribution_ggx(
-    n_dot_wh: Float[Tensor, "*batch 1"], alpha: Float[Tensor, "*batch 1"]
+    n_dot_wh: Float[Tensor, "*batch 1"], alpha: Float[Tensor, "*#batch 1"]
 ) -> Float[Tensor, "*batch 1"]:
     """Density D of microfacet normals per solid angle. Source: Walter et al. 2007, eq. 33."""
     cosine_squared = n_dot_wh * n_dot_wh
@@ -30,7 +30,7 @@ def distribution_ggx(
 
 
 def smith_lambda(
-    n_dot_w: Float[Tensor, "*batch 1"], alpha: Float[Tensor, "*batch 1"]
+    n_dot_w: Float[Tensor, "*batch 1"], alpha: Float[Tensor, "*#batch 1"]
 ) -> Float[Tensor, "*batch 1"]:
     """Smith's Lambda: hidden over visible microfacet area. Source: Heitz 2014, eq. 72."""
     cosine_squared = (n_dot_w * n_dot_w).clamp_min(MIN_NORM_SQUARED)
@@ -41,7 +41,7 @@ def smith_lambda(
 def masking_shadowing(
     n_dot_wo: Float[Tensor, "*batch 1"],
     n_dot_wi: Float[Tensor, "*batch 1"],
-    alpha: Float[Tensor, "*batch 1"],
+    alpha: Float[Tensor, "*#batch 1"],
 ) -> Float[Tensor, "*batch 1"]:
     """Height-correlated Smith G2. Source: Heitz 2014, eq. 99."""
     return 1.0 / (1.0 + smith_lambda(n_dot_wo, alpha) + smith_lambda(n_dot_wi, alpha))
@@ -63,8 +63,8 @@ def schlick_weight(cosine: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 1
 
 def sample_visible_normal(
     wo_local: Float[Tensor, "*batch 3"],
-    alpha: Float[Tensor, "*batch 1"],
-    u: Float[Tensor, "*batch 2"],
+    alpha: Float[Tensor, "*#batch 1"],
+    u: Float[Tensor, "*#batch 2"],
 ) -> Float[Tensor, "*batch 3"]:
     """Half vectors from the distribution of normals visible from `wo_local` (z is the normal).
 
@@ -82,7 +82,7 @@ def sample_visible_normal(
 def visible_normal_density(
     n_dot_wo: Float[Tensor, "*batch 1"],
     n_dot_wh: Float[Tensor, "*batch 1"],
-    alpha: Float[Tensor, "*batch 1"],
+    alpha: Float[Tensor, "*#batch 1"],
 ) -> Float[Tensor, "*batch 1"]:
     """Density per solid angle of the light direction that a visible normal reflects to.
 
