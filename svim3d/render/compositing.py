@@ -27,7 +27,7 @@ def surface_opacity(
     sdf: Float[Tensor, "N 1"],
     slope: Float[Tensor, "N 1"],
     step: float,
-    sharpness: Float[Tensor, ""],
+    sharpness: float,
 ) -> Float[Tensor, "N 1"]:
     """Opacity of a section of a ray through a signed distance.
 
