@@ -48,41 +48,44 @@ def texel_view(
     *,
     texture_size: int,
 ) -> TexelView:
-    """The matrix of every pixel that a single smooth piece of surface covers wholly."""
-    samples = SAMPLES_PER_AXIS**2
+    """The matrix of every pixel that one smooth piece of surface covers wholly, in all views."""
     per_view = cameras.height * cameras.width
-    face_normal = normalize(face_normals_scaled(vertices, faces))
     blocks, pixels, trusts = [], [], []
     for view in range(len(cameras)):
-        clip = cameras[view].project(vertices)[0]
-        size = cameras.height * SAMPLES_PER_AXIS, cameras.width * SAMPLES_PER_AXIS
-        fragments = rasterize(clip, faces, *size)
-        at, values = interpolate(clip, faces, fragments, torch.cat([uv, vertices], 1))
-        row = at // size[1] // SAMPLES_PER_AXIS
-        column = at % size[1] // SAMPLES_PER_AXIS
-        pixel = row * cameras.width + column
-        to_viewer = cameras.positions[view] - values[:, 2:]
-        normal = face_normal[fragments.triangle.reshape(-1)[at].long()]
-        cosine = dot(normal, normalize(to_viewer))[:, 0]
-        whole, mean_cosine = _whole_pixels(pixel, to_viewer.norm(dim=1), cosine, per_view)
-        kept = torch.nonzero(whole)[:, 0]
-        row_of = torch.full((per_view,), -1).index_copy(0, kept, torch.arange(len(kept)))
-        inside = torch.nonzero(whole[pixel])[:, 0]
-        texel, weight = bilinear_taps(values[inside, :2], texture_size, texture_size)
-        rows = row_of[pixel[inside]][:, None].expand_as(texel)
-        blocks.append(
-            scipy.sparse.csr_matrix(
-                (
-                    (weight / samples).reshape(-1).numpy(),
-                    (rows.reshape(-1).numpy(), texel.reshape(-1).numpy()),
-                ),
-                (len(kept), texture_size**2),
-            )
-        )
-        pixels.append(kept + view * per_view)
-        trusts.append(mean_cosine[kept])
+        block, pixel, trust = _one_view(vertices, faces, uv, cameras[view], texture_size)
+        blocks.append(block)
+        pixels.append(pixel + view * per_view)
+        trusts.append(trust)
     matrix = scipy.sparse.vstack(blocks).tocsr()
     return TexelView(SparseOperator(matrix), torch.cat(pixels), torch.cat(trusts)[:, None])
+
+
+def _one_view(
+    vertices: Tensor, faces: Tensor, uv: Tensor, camera: Cameras, texture_size: int
+) -> tuple[scipy.sparse.csr_matrix, Tensor, Tensor]:
+    """Rows of one view, their pixels, and the cosine under which each sees the surface."""
+    samples = SAMPLES_PER_AXIS**2
+    height, width = camera.height * SAMPLES_PER_AXIS, camera.width * SAMPLES_PER_AXIS
+    clip = camera.project(vertices)[0]
+    fragments = rasterize(clip, faces, height, width)
+    sample, values = interpolate(clip, faces, fragments, torch.cat([uv, vertices], 1))
+    row, column = sample // width // SAMPLES_PER_AXIS, sample % width // SAMPLES_PER_AXIS
+    pixel = row * camera.width + column
+
+    to_viewer = camera.positions - values[:, 2:]
+    face = fragments.triangle.reshape(-1)[sample].long()
+    normal = normalize(face_normals_scaled(vertices, faces))[face]
+    cosine = dot(normal, normalize(to_viewer))[:, 0]
+    whole, trust = _whole_pixels(pixel, to_viewer.norm(dim=1), cosine, camera.height * camera.width)
+    kept = torch.nonzero(whole)[:, 0]
+    row_of = torch.full((len(whole),), -1).index_copy(0, kept, torch.arange(len(kept)))
+    inside = torch.nonzero(whole[pixel])[:, 0]
+    texel, weight = bilinear_taps(values[inside, :2], texture_size, texture_size)
+    rows = row_of[pixel[inside]][:, None].expand_as(texel)
+    entries = (weight / samples).reshape(-1).numpy()
+    places = rows.reshape(-1).numpy(), texel.reshape(-1).numpy()
+    block = scipy.sparse.csr_matrix((entries, places), (len(kept), texture_size**2))
+    return block, kept, trust[kept]
 
 
 def _whole_pixels(
@@ -96,15 +99,14 @@ def _whole_pixels(
     nearest = torch.full((count,), torch.inf).scatter_reduce(0, pixel, distance, "amin")
     farthest = torch.zeros(count).scatter_reduce(0, pixel, distance, "amax")
     mean = torch.bincount(pixel, weights=cosine.double(), minlength=count).float() / hits.clamp(1)
-    # A slanted surface spans depth in proportion to the pixel; that is no edge.
     whole = (hits == SAMPLES_PER_AXIS**2) & (farthest - nearest < MAX_DEPTH_SPREAD)
     return whole, mean
 
 
 def fit_texels(
-    seen: TexelView,
+    operator: SparseOperator,
     target: Float[Tensor, "P C"],
-    weight: Float[Tensor, "P C"],
+    weight: Float[Tensor, "P 1"],
     start: Float[Tensor, "T C"],
     *,
     prior: float,
@@ -115,16 +117,16 @@ def fit_texels(
     Conjugate gradients on the normal equations, one system per channel with its own step lengths.
     Few iterations regularise as the prior does: what the views determine well comes first.
     """
-    apply, adjoint = seen.operator, seen.operator.adjoint
-    residual = adjoint(weight * (target - apply(start)))
+    residual = operator.adjoint(weight * (target - operator(start)))
     change = torch.zeros_like(start)
-    direction = residual.clone()
+    direction = residual
     energy = residual.square().sum(0)
+    tiny = torch.finfo(energy.dtype).tiny  # a channel that is already exact divides zero by it
     for _ in range(iterations):
-        product = adjoint(weight * apply(direction)) + prior * direction
-        step = energy / (direction * product).sum(0).clamp_min(torch.finfo(energy.dtype).tiny)
+        product = operator.adjoint(weight * operator(direction)) + prior * direction
+        step = energy / (direction * product).sum(0).clamp_min(tiny)
         change = change + step * direction
         residual = residual - step * product
         previous, energy = energy, residual.square().sum(0)
-        direction = residual + energy / previous.clamp_min(torch.finfo(energy.dtype).tiny) * direction
+        direction = residual + energy / previous.clamp_min(tiny) * direction
     return start + change

@@ -1,4 +1,4 @@
-"""Phase 2 on an analytic sphere: it mends a wrong start, resumes to the byte, refuses no surface."""
+"""Phase 2 on an analytic sphere: mends a wrong start, resumes to the byte, refuses no surface."""
 
 import math
 
