@@ -7,7 +7,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -54,6 +54,7 @@ class SurfaceSamples:
     coverage: Float[Tensor, "R 1"]
 
 
+@runtime_checkable
 class Volume(Protocol):
     """A trainable distribution of opacity in the cube [-half_extent, half_extent]^3."""
 
@@ -151,6 +152,7 @@ class DensityVolume(nn.Module):
     Source: Mueller et al. 2022, appendix C, on the visual hull instead of the whole cube.
     """
 
+    hull: Tensor
     occupancy: Tensor
 
     def __init__(
@@ -166,18 +168,19 @@ class DensityVolume(nn.Module):
         self.step = 2.0 * half_extent / MAX_STEPS_ACROSS
         self.field = DensityField(spec, DENSITY_HIDDEN, half_extent)
         sdf = resample_grid(hull, OCCUPANCY_CELLS + 1)
-        self._hull = classify_cells(sdf, 2.0 * half_extent / OCCUPANCY_CELLS) != EMPTY
+        near_hull = classify_cells(sdf, 2.0 * half_extent / OCCUPANCY_CELLS) != EMPTY
+        self.register_buffer("hull", near_hull, persistent=False)
         start = torch.full_like(sdf[1:, 1:, 1:], START_DENSITY)
         self.register_buffer("occupancy", start)
 
     def reset(self, generator: torch.Generator) -> None:
         """Draw the start of the network."""
         self.field.reset(generator)
-        self.cells = torch.where(self._hull, SURFACE, EMPTY).byte()
+        self.cells = torch.where(self.hull, SURFACE, EMPTY).byte()
 
     def refresh(self, generator: torch.Generator) -> None:
         """Decayed running maximum of the density at one random point of each hull cell."""
-        cells = torch.nonzero(self._hull.cpu()).to(self.occupancy.device)
+        cells = torch.nonzero(self.hull)
         offset = torch.rand(cells.shape, generator=generator).to(cells.device)
         points = (cells + offset) * (2.0 * self.half_extent / OCCUPANCY_CELLS) - self.half_extent
         with torch.no_grad():
@@ -185,7 +188,7 @@ class DensityVolume(nn.Module):
         index = tuple(cells.unbind(-1))
         self.occupancy[index] = torch.maximum(self.occupancy[index] * OCCUPANCY_DECAY, density)
         opaque = density_opacity(self.occupancy, self.step) > MIN_OCCUPIED_OPACITY
-        self.cells = torch.where(self._hull & opaque, SURFACE, EMPTY).byte()
+        self.cells = torch.where(self.hull & opaque, SURFACE, EMPTY).byte()
 
     def trace(self, rays: Rays, jitter: Float[Tensor, "R"], min_weight: float) -> SurfaceSamples:
         """See `Volume`."""
@@ -215,11 +218,10 @@ class DensityVolume(nn.Module):
 
     def signed_distance(self, nodes: int) -> Float[Tensor, "n n n"]:
         """See `Volume`: (log density - log threshold) / |gradient| near the surface."""
-        hull = self._hull
         positions = node_positions(nodes, self.half_extent, like=self.occupancy).view(-1, 3)
         with torch.no_grad():
             blocks = [self.field(part) for part in positions.split(NODES_PER_BLOCK)]
         level = torch.cat(blocks).view(nodes, nodes, nodes) - math.log(self.threshold)
         cell = (positions + self.half_extent) * (OCCUPANCY_CELLS / (2.0 * self.half_extent))
         x, y, z = cell.long().clamp(0, OCCUPANCY_CELLS - 1).unbind(-1)
-        return redistance(level.masked_fill(~hull[x, y, z].view_as(level), -1.0), self.half_extent)
+        return redistance(level.masked_fill(~self.hull[x, y, z].view_as(level), -1.0), self.half_extent)
