@@ -90,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
         help="where artifacts are kept (%(default)s)",
     )
     job = _job_options()
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     for name, parents, purpose in (
         ("run", [job, shared], "make the asset; finished stages are taken from the store"),
         ("plan", [job, shared], "say which stages a run would compute, and why"),

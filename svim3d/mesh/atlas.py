@@ -196,7 +196,7 @@ def _lay_out(
         index = index.reshape(-1)
         points = np.zeros((len(pairs), 2))
         points[index] = flat.reshape(-1, 2)
-        uv = _pack(points, pairs[:, 0], size, gutter_px)
+        uv = _pack(points, pairs[:, 0], size, float(gutter_px))
         faces = index.reshape(-1, 3)
         texels = rasterize_uv(torch.from_numpy(uv).float(), torch.from_numpy(faces), size)
         top = np.unique(texels.overlapping.numpy())

@@ -25,7 +25,7 @@ def bumpy():
 
 
 def by_xatlas(vertices, faces, **options):
-    return unwrap_charts(vertices, faces, timeout_s=120, **options)
+    return unwrap_charts(vertices, faces, timeout_s=120.0, **options)
 
 
 def by_boxes(vertices, faces, **options):
@@ -128,14 +128,14 @@ def test_boxes_take_over_when_xatlas_hangs_or_fails(bumpy, monkeypatch, tmp_path
     worker.write_text(program)
     monkeypatch.setattr(xatlas_process, "__file__", str(worker))
     atlas = unwrap(
-        *bumpy, texture_size=64, gutter_px=2, timeout_s=0.5 if "sleep" in program else 30
+        *bumpy, texture_size=64, gutter_px=2, timeout_s=0.5 if "sleep" in program else 30.0
     )
     assert reason in atlas.fallback
     assert atlas.texels.overlaps == 0
 
 
 def test_unwrapping_is_deterministic(bumpy):
-    a, b = (unwrap(*bumpy, texture_size=64, gutter_px=2, timeout_s=120) for _ in range(2))
+    a, b = (unwrap(*bumpy, texture_size=64, gutter_px=2, timeout_s=120.0) for _ in range(2))
     assert a.fallback is None
     assert torch.equal(a.uv, b.uv)
     assert torch.equal(a.faces, b.faces)

@@ -1,0 +1,193 @@
+"""The house rules, read off the syntax trees: who imports whom, and how long things may be.
+
+The tables here are the rules' only copy.
+"""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).resolve().parents[1]
+FLOORS = ("flows", "stages", "svim3d")
+MAX_FILE_LINES, MAX_FUNCTION_LINES = 400, 60
+
+# Who may import what of ours. The longest matching prefix counts; a module may always import what
+# lies in its own package, except a stage, which knows no other stage.
+BASICS = ("svim3d.numerics", "svim3d.color", "svim3d.compiled")
+MIDDLE = (
+    "cameras",
+    "optim",
+    "losses",
+    "metrics",
+    "shading",
+    "fields",
+    "raster",
+    "mesh",
+    "diffusion",
+)
+TIER_1 = tuple(f"svim3d.{name}" for name in MIDDLE)
+CONTRACT = ("stages.base", "stages.artifacts", "stages.errors", "stages.settings")
+MAY_IMPORT = {
+    "svim3d": BASICS,
+    "svim3d.render": (*BASICS, *TIER_1),
+    "svim3d.io": (*BASICS, *TIER_1),
+    "svim3d.charts": (*BASICS, *TIER_1),
+    "stages": ("svim3d", *CONTRACT),
+    "stages.settings": ("stages.settings",),
+    "stages.errors": (),
+    "stages.base": ("svim3d", "stages.errors"),
+    "stages.artifacts": ("svim3d",),
+    "stages.keys": ("stages.errors",),
+    "stages.manifest": ("stages.keys",),
+    "stages.store": ("stages.keys", "stages.manifest", "stages.errors"),
+    "stages.execution": (*CONTRACT, "stages.keys", "stages.store"),
+    "flows": ("flows", "stages"),
+}
+# Inside svim3d a unit of the middle tier sees itself and the basics.
+UNITS = {name: f"svim3d.{name}" for name in (*MIDDLE, "render", "io")}
+
+# One library, one door.
+DOORS = {
+    "prefect": ("flows",),
+    "uvicorn": ("flows.engine_server",),
+    "rich": ("flows",),
+    "pydantic": ("flows", "stages.settings"),
+    "yaml": ("flows",),
+    "OpenEXR": ("svim3d.io.exr",),
+    "safetensors": ("svim3d.io.weights",),
+    "PIL": ("svim3d.io.image",),
+    "trimesh": ("svim3d.io.glb", "svim3d.io.obj"),
+    "xatlas": ("svim3d.mesh.xatlas_process",),
+    "pymeshlab": ("svim3d.mesh.cleanup",),
+    "fast_simplification": ("svim3d.mesh.cleanup",),
+    "numba": ("svim3d",),
+    "scipy": ("svim3d",),
+    "kornia": ("svim3d",),
+    "torch": ("svim3d", "stages", "flows"),
+    "numpy": ("svim3d", "stages"),
+    "jaxtyping": ("svim3d", "stages"),
+}
+# What a plan and `--help` load: no torch, no Prefect at the top of these modules.
+LIGHT = (
+    "flows.cli",
+    "flows.commands",
+    "flows.config",
+    "flows.console",
+    "flows.engine",
+    "flows.pipeline",
+    "flows.plan",
+    "flows.run_folder",
+    "stages.errors",
+    "stages.keys",
+    "stages.manifest",
+    "stages.store",
+    "stages.settings",
+)
+HEAVY = {"torch", "prefect", "numba", "kornia", "scipy", "stages.base", "stages.execution"}
+
+# The library computes: it meets no files (io apart), clocks, environment or global state.
+UNSEEN_BY_LIBRARY = {"os", "pathlib", "random", "time", "logging", "argparse", "shutil", "tempfile"}
+FILE_DOORS = ("svim3d.io", "svim3d.charts")
+GLOBAL_RANDOMNESS = {"torch.manual_seed", "numpy.random", "np.random.seed", "random.random"}
+
+
+def modules() -> dict[str, Path]:
+    """Dotted names and files of all our source."""
+    found = {}
+    for floor in FLOORS:
+        for file in sorted((PROJECT / floor).rglob("*.py")):
+            parts = file.relative_to(PROJECT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file
+    return found
+
+
+MODULES = modules()
+TREES = {name: ast.parse(file.read_text()) for name, file in MODULES.items()}
+
+
+def is_within(name: str, prefixes: tuple[str, ...] | frozenset[str] | set[str]) -> bool:
+    return any(name == prefix or name.startswith(f"{prefix}.") for prefix in prefixes)
+
+
+def imports(nodes: Iterator[ast.AST]) -> Iterator[str]:
+    """Modules named by import statements; `from a import b` names `a.b` where that is a module."""
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            for alias in node.names:
+                full = f"{base}.{alias.name}"
+                yield full if full in MODULES else base
+
+
+def top_level(tree: ast.Module) -> Iterator[ast.AST]:
+    """Statements that run on import: not those for type checkers, not those inside functions."""
+    for node in tree.body:
+        is_for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+        if not is_for_types:
+            yield node
+
+
+def permitted(module: str) -> tuple[str, ...]:
+    """What `module` may import of ours."""
+    rule = max((p for p in MAY_IMPORT if is_within(module, (p,))), key=len)
+    unit = ".".join(module.split(".")[:2])
+    own = (unit,) if unit in UNITS.values() or rule.startswith("stages.settings") else ()
+    return (*MAY_IMPORT[rule], *own)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_point_down(module):
+    ours = {name for name in imports(ast.walk(TREES[module])) if name.partition(".")[0] in FLOORS}
+    assert not {name for name in ours if not is_within(name, permitted(module))}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_each_library_has_one_door(module):
+    used = {name.partition(".")[0] for name in imports(ast.walk(TREES[module]))}
+    assert not {name for name in used & set(DOORS) if not is_within(module, DOORS[name])}
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if is_within(m, LIGHT)])
+def test_planning_stays_light(module):
+    loaded = {module}
+    queue = [module]
+    while queue:
+        for name in imports(top_level(TREES[queue.pop()])):
+            assert not is_within(name, HEAVY), f"{module} loads {name}"
+            if name in MODULES and name not in loaded:
+                loaded.add(name)
+                queue.append(name)
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if is_within(m, ("svim3d",))])
+def test_library_sees_tensors_only(module):
+    if not is_within(module, FILE_DOORS):
+        used = {name.partition(".")[0] for name in imports(ast.walk(TREES[module]))}
+        assert not used & UNSEEN_BY_LIBRARY
+    calls = [node for node in ast.walk(TREES[module]) if isinstance(node, ast.Call)]
+    names = {ast.unparse(call.func) for call in calls}
+    assert "print" not in names
+    assert not {name for name in names if is_within(name, GLOBAL_RANDOMNESS)}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_files_and_functions_stay_short(module):
+    assert len(MODULES[module].read_text().splitlines()) <= MAX_FILE_LINES
+    for node in ast.walk(TREES[module]):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            code = node.end_lineno - node.lineno + 1 - _docstring_lines(node)
+            assert code <= MAX_FUNCTION_LINES, f"{node.name} has {code} lines"
+
+
+def _docstring_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    if ast.get_docstring(node) is None:
+        return 0
+    return node.body[0].end_lineno - node.body[0].lineno + 1
+
+
+def test_every_module_is_judged():
+    assert {"flows.cli", "stages.store", "svim3d.numerics"} <= set(MODULES)
