@@ -207,7 +207,7 @@ def chart(gradients: dict[str, dict[str, tuple[float, float]]], file: Path) -> N
     axes.set_ylabel("cosine to finite differences")
     axes.axhline(1.0, color="grey", linewidth=0.8)
     axes.set_title("Silhouette gradients by rule (triangles in brackets)")
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=len(RULES))
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=120)
 
