@@ -28,26 +28,26 @@ class SparseOperator:
     def __init__(self, matrix: scipy.sparse.csr_matrix) -> None:
         """Keep `matrix` and its transpose; duplicates must be summed already."""
         self.shape: tuple[int, int] = matrix.shape
-        self._forward = _Csr(matrix)
-        self._adjoint = _Csr(matrix.T.tocsr())
+        self.forward_matrix = CsrMatrix(matrix)
+        self.adjoint_matrix = CsrMatrix(matrix.T.tocsr())
 
     @property
     def stored(self) -> int:
         """Number of stored entries."""
-        return len(self._forward.values)
+        return len(self.forward_matrix.values)
 
     def __call__(self, x: Float[Tensor, "columns c"]) -> Float[Tensor, "rows c"]:
         """The product; differentiable in `x`."""
-        product: Tensor = _Product.apply(x, self._forward, self._adjoint)  # type: ignore[no-untyped-call]
+        product: Tensor = _Product.apply(x, self.forward_matrix, self.adjoint_matrix)  # type: ignore[no-untyped-call]
         return product
 
     def adjoint(self, y: Float[Tensor, "rows c"]) -> Float[Tensor, "columns c"]:
         """The product with the transpose; differentiable in `y`."""
-        product: Tensor = _Product.apply(y, self._adjoint, self._forward)  # type: ignore[no-untyped-call]
+        product: Tensor = _Product.apply(y, self.adjoint_matrix, self.forward_matrix)  # type: ignore[no-untyped-call]
         return product
 
 
-class _Csr:
+class CsrMatrix:
     """One CSR matrix, with a copy per device and dtype that has asked for it."""
 
     def __init__(self, matrix: scipy.sparse.csr_matrix) -> None:
@@ -59,6 +59,7 @@ class _Csr:
         self._tensors: dict[tuple[torch.device, torch.dtype], Tensor] = {}
 
     def multiply(self, x: Tensor) -> Tensor:
+        """The product, without a gradient, on the device and in the dtype of `x`."""
         if x.device.type != "cpu":
             return self.tensor(x) @ x
         dense = x.detach().contiguous().numpy()
@@ -85,7 +86,7 @@ class _Product(torch.autograd.Function):
     """y = A x, dx = A^T dy."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, matrix: _Csr, transpose: _Csr) -> Tensor:
+    def forward(ctx: Any, x: Tensor, matrix: CsrMatrix, transpose: CsrMatrix) -> Tensor:
         ctx.transpose = transpose
         return matrix.multiply(x)
 

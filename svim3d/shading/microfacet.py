@@ -15,14 +15,14 @@ from svim3d.numerics import MIN_NORM_SQUARED, normalize, saturate
 MIN_ALPHA = 1e-4  # keeps the distribution finite for a perfect mirror (roughness 0.01)
 
 
-def alpha_from_roughness(roughness: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 1"]:
+def alpha_from_roughness(roughness: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "*#batch 1"]:
     """GGX width of a perceptual roughness. Source: Burley 2012, section 5.4."""
     return (roughness * roughness).clamp_min(MIN_ALPHA)
 
 
 def distribution_ggx(
-    n_dot_wh: Float[Tensor, "*batch 1"], alpha: Float[Tensor, "*batch 1"]
-) -> Float[Tensor, "*batch 1"]:
+    n_dot_wh: Float[Tensor, "*#batch 1"], alpha: Float[Tensor, "*#batch 1"]
+) -> Float[Tensor, "*#batch 1"]:
     """Density D of microfacet normals per solid angle. Source: Walter et al. 2007, eq. 33."""
     cosine_squared = n_dot_wh * n_dot_wh
     spread = alpha * alpha * cosine_squared + (1.0 - cosine_squared).clamp_min(0.0)
@@ -30,8 +30,8 @@ def distribution_ggx(
 
 
 def smith_lambda(
-    n_dot_w: Float[Tensor, "*batch 1"], alpha: Float[Tensor, "*batch 1"]
-) -> Float[Tensor, "*batch 1"]:
+    n_dot_w: Float[Tensor, "*#batch 1"], alpha: Float[Tensor, "*#batch 1"]
+) -> Float[Tensor, "*#batch 1"]:
     """Smith's Lambda: hidden over visible microfacet area. Source: Heitz 2014, eq. 72."""
     cosine_squared = (n_dot_w * n_dot_w).clamp_min(MIN_NORM_SQUARED)
     tangent_squared = (1.0 - cosine_squared).clamp_min(0.0) / cosine_squared
@@ -39,22 +39,22 @@ def smith_lambda(
 
 
 def masking_shadowing(
-    n_dot_wo: Float[Tensor, "*batch 1"],
-    n_dot_wi: Float[Tensor, "*batch 1"],
-    alpha: Float[Tensor, "*batch 1"],
-) -> Float[Tensor, "*batch 1"]:
+    n_dot_wo: Float[Tensor, "*#batch 1"],
+    n_dot_wi: Float[Tensor, "*#batch 1"],
+    alpha: Float[Tensor, "*#batch 1"],
+) -> Float[Tensor, "*#batch 1"]:
     """Height-correlated Smith G2. Source: Heitz 2014, eq. 99."""
     return 1.0 / (1.0 + smith_lambda(n_dot_wo, alpha) + smith_lambda(n_dot_wi, alpha))
 
 
 def fresnel_schlick(
-    f0: Float[Tensor, "*batch c"], wo_dot_wh: Float[Tensor, "*batch 1"]
-) -> Float[Tensor, "*batch c"]:
+    f0: Float[Tensor, "*#batch c"], wo_dot_wh: Float[Tensor, "*#batch 1"]
+) -> Float[Tensor, "*#batch c"]:
     """Fresnel reflectance, Schlick's approximation. Source: Schlick 1994, eq. 15."""
     return f0 + (1.0 - f0) * schlick_weight(wo_dot_wh)
 
 
-def schlick_weight(cosine: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 1"]:
+def schlick_weight(cosine: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "*#batch 1"]:
     """(1 - cosine)^5."""
     remainder = saturate(1.0 - cosine)
     squared = remainder * remainder
@@ -62,10 +62,10 @@ def schlick_weight(cosine: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 1
 
 
 def sample_visible_normal(
-    wo_local: Float[Tensor, "*batch 3"],
-    alpha: Float[Tensor, "*batch 1"],
-    u: Float[Tensor, "*batch 2"],
-) -> Float[Tensor, "*batch 3"]:
+    wo_local: Float[Tensor, "*#batch 3"],
+    alpha: Float[Tensor, "*#batch 1"],
+    u: Float[Tensor, "*#batch 2"],
+) -> Float[Tensor, "*#batch 3"]:
     """Half vectors from the distribution of normals visible from `wo_local` (z is the normal).
 
     Source: Dupuy and Benyoub 2023, "Sampling visible GGX normals with spherical caps", listing 3.
@@ -80,10 +80,10 @@ def sample_visible_normal(
 
 
 def visible_normal_density(
-    n_dot_wo: Float[Tensor, "*batch 1"],
-    n_dot_wh: Float[Tensor, "*batch 1"],
-    alpha: Float[Tensor, "*batch 1"],
-) -> Float[Tensor, "*batch 1"]:
+    n_dot_wo: Float[Tensor, "*#batch 1"],
+    n_dot_wh: Float[Tensor, "*#batch 1"],
+    alpha: Float[Tensor, "*#batch 1"],
+) -> Float[Tensor, "*#batch 1"]:
     """Density per solid angle of the light direction that a visible normal reflects to.
 
     D_v(h) / (4 wo.h) = G1(wo) D(h) / (4 n.wo). Source: Heitz 2018, eq. 3 and 17.

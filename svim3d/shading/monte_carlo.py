@@ -65,7 +65,7 @@ def shade_by_sampling(
     n_dot_wo = dot(normal, wo).clamp_min(MIN_N_DOT_V)
     tangent, bitangent = tangent_frame(normal)
     frame = torch.stack([tangent, bitangent, normal], -2)
-    wo_local = normalize(frame @ wo[..., None])[..., 0]
+    wo_local = normalize((frame @ wo[..., None])[..., 0])
     single, _ = lobe_albedos(f0, n_dot_wo, roughness, multiple_scattering=False)
     base = diffuse_albedo(basecolor, metallic) * (1.0 - single) / math.pi
     diffuse, specular = torch.zeros_like(basecolor), torch.zeros_like(basecolor)

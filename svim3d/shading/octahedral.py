@@ -16,6 +16,7 @@ from torch import Tensor
 
 from svim3d.numerics import normalize
 
+MIN_L1_NORM = 1e-12  # sends the zero vector (no surface there) to the pole instead of to NaN
 DOUBLE = torch.empty(0, dtype=torch.float64)  # a `like` for tables that are built once
 
 
@@ -25,8 +26,8 @@ def _sign(x: Tensor) -> Tensor:
 
 
 def octahedral_from_direction(d: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
-    """Square coordinates (u, v) in [-1, 1] of non-zero directions of any length."""
-    x, y, z = (d / d.abs().sum(-1, keepdim=True)).unbind(-1)
+    """Square coordinates (u, v) in [-1, 1] of directions of any length."""
+    x, y, z = (d / d.abs().sum(-1, keepdim=True).clamp_min(MIN_L1_NORM)).unbind(-1)
     upper = y >= 0
     u = torch.where(upper, x, (1.0 - z.abs()) * _sign(x))
     v = torch.where(upper, z, (1.0 - x.abs()) * _sign(z))

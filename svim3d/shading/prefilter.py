@@ -40,10 +40,10 @@ SAMPLED_IRRADIANCE_COUNT = 16  # Source: SViM3D, section 4
 SAMPLED_SHIFT = (0, 1, 2, 3, 4)  # each level has half the side of the one before
 # Steps of about two in lobe width keep the blend of two levels within 2 % under a broad light.
 EXACT_ROUGHNESS = (0.0, 0.1, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0)
-EXACT_SHIFT = (0, 0, 1, 1, 2, 2, 3, 3)  # a texel is at most half as wide as the level's lobe
+EXACT_SHIFT = (0, 0, 1, 1, 2, 2, 2, 2)  # a texel is at most half as wide as the level's lobe
 EXACT_ACCURACY = (0.7, 0.7, 0.7, 0.35, 0.35, 0.35, 0.35)  # coarse levels are cheap to do well
-SMALLEST_LEVEL = 8
-IRRADIANCE_SIZE = 16  # the cosine lobe damps everything finer
+SMALLEST_LEVEL = 8  # keeps the widest lobe's gradient
+IRRADIANCE_SIZE = 32  # at the map's creases bilinear lookup is off by half a texel's slope
 
 
 @dataclass(frozen=True)

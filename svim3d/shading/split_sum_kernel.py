@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from svim3d.compiled import kernel
 from svim3d.shading.directional_albedo import MIN_N_DOT_V, SCHLICK_MEAN_WEIGHT, TABLE_SIZE
 from svim3d.shading.metallic_roughness import DIELECTRIC_F0
+from svim3d.shading.octahedral import MIN_L1_NORM
 
 Array = NDArray[Any]
 Triple = tuple[float, float, float]
@@ -243,7 +244,8 @@ def _table_lookup(
     """A, B, and their derivatives by n.v and by roughness."""
     root, span = math.sqrt(n_dot_v), TABLE_SIZE - 1
     x, y = root * span, min(max(r, 0.0), 1.0) * span
-    x0, y0 = min(int(x), TABLE_SIZE - 2), min(int(y), TABLE_SIZE - 2)
+    # Bounded from below too: a NaN must come out as NaN, not as a read outside the table.
+    x0, y0 = max(0, min(int(x), TABLE_SIZE - 2)), max(0, min(int(y), TABLE_SIZE - 2))
     fx, fy = x - x0, y - y0
     along, within = span / (2.0 * root), float(span) if 0.0 <= r <= 1.0 else 0.0
     low_a = table[y0, x0, 0] + fx * (table[y0, x0 + 1, 0] - table[y0, x0, 0])
@@ -280,7 +282,7 @@ def _level(knots: Array, r: float) -> tuple[int, float, float]:
 @kernel()
 def _locate(x: float, y: float, z: float, size: int) -> Taps:
     """Four texels around a direction and the position between them."""
-    norm = abs(x) + abs(y) + abs(z)
+    norm = max(abs(x) + abs(y) + abs(z), MIN_L1_NORM)
     u, v = x / norm, z / norm
     if y < 0.0:
         u, v = (1.0 - abs(v)) * _sign(u), (1.0 - abs(u)) * _sign(v)
@@ -336,7 +338,7 @@ def _scatter(grad: Array, offset: int, taps: Taps, c: int, value: float) -> None
 @kernel()
 def _square_adjoint(x: float, y: float, z: float, g_u: float, g_v: float) -> Triple:
     """Derivative by the direction, given those by its square coordinates."""
-    norm = abs(x) + abs(y) + abs(z)
+    norm = max(abs(x) + abs(y) + abs(z), MIN_L1_NORM)
     a, b = x / norm, z / norm
     g_a, g_b = g_u, g_v
     if y < 0.0:

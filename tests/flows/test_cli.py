@@ -1,8 +1,8 @@
 """The command line: answers at once, refuses in one line, exits with a code for scripts."""
 
+import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -26,12 +26,12 @@ finally:
     heavy = {"torch", "prefect", "pydantic", "yaml", "rich", "numpy"} & set(sys.modules)
     assert not heavy, heavy
 """
-    seconds = []
-    for _ in range(3):
-        start = time.perf_counter()
-        subprocess.run([sys.executable, "-c", script], cwd=PROJECT, check=True)
-        seconds.append(time.perf_counter() - start)
-    assert min(seconds) < HELP_LIMIT_S
+    # Processor seconds: the wall clock would measure what else this machine does.
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, "-c", script], cwd=PROJECT, check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    assert cpu_s < HELP_LIMIT_S
 
 
 @pytest.mark.parametrize("command", ["run", "plan", "presets", "doctor"])

@@ -136,7 +136,12 @@ def files_of(stored: Stored) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize(
-    ("stop", "code"), [(signal.SIGKILL, -9), (signal.SIGTERM, 130), (signal.SIGINT, 130)]
+    ("stop", "code"),
+    [
+        (signal.SIGKILL, -9),
+        (signal.SIGINT, 130),
+        pytest.param(signal.SIGTERM, 130, marks=pytest.mark.slow),
+    ],
 )
 def test_stopped_run_goes_on_and_ends_with_equal_bytes(engine, tmp_path, source, stop, code):
     store, untouched = Store(tmp_path / "store"), Store(tmp_path / "untouched")
