@@ -32,7 +32,7 @@ from svim3d.render.pixel_blocks import PIXELS, PixelBlocks
 from svim3d.render.volumes import DensityVolume, SdfVolume
 from svim3d.render.volumetric import Rendered, render_rays
 
-SDF, ENVIRONMENT = "volume.grid", "log_environment"  # names of parameters
+SDF, ENVIRONMENT = "volume.", "log_environment"  # names of parameters
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +71,8 @@ class _Fit:
         named[ENVIRONMENT] = log_environment
         rates = {name: _rate(name, config) for name in named}
         if isinstance(volume, SdfVolume):
-            rates[SDF] = Rate(config.sdf_rate * volume.cell)
+            distance = Rate(config.sdf_rate * volume.cell)
+            rates |= {name: distance for name in named if name.startswith(SDF)}
         return cls(volume, materials, log_environment, NamedAdam(named, rates))
 
     def grow(self, nodes: int, config: NerfConfig) -> None:
@@ -81,15 +82,22 @@ class _Fit:
         """
         assert isinstance(self.volume, SdfVolume)
         ratio = (len(self.volume.grid) / nodes) ** 3
-        self.volume.resample(nodes)
+        self.volume.resample(nodes, config.coarse_below(nodes))
+        rate = Rate(config.sdf_rate * self.volume.cell)
+        fresh = {f"volume.{n}": p for n, p in self.volume.named_parameters()}
+        for name in [n for n in self.adam.parameters if n.startswith(SDF) and n not in fresh]:
+            self.adam.remove(name)
+        for name in fresh.keys() - {f"{SDF}grid"}:
+            self.adam.replace(name, fresh[name], rate)
         self.adam.replace(
-            SDF,
+            f"{SDF}grid",
             self.volume.grid,
-            Rate(config.sdf_rate * self.volume.cell),
-            lambda moment, old: (
-                resample_grid(old, nodes) * (ratio if moment == "exp_avg" else ratio**2)
-            ),
+            rate,
+            lambda moment, old: resample_grid(old, nodes) * ratio ** MOMENT_POWER[moment],
         )
+
+
+MOMENT_POWER = {"exp_avg": 1, "exp_avg_sq": 2}
 
 
 def _rate(name: str, config: NerfConfig) -> Rate:
@@ -169,7 +177,8 @@ def _pixel_blocks(
 ) -> PixelBlocks:
     """Blocks of which some ray comes near the hull; all others show nothing and teach nothing."""
     blocks = PixelBlocks.cut(cameras, planes)
-    volume = SdfVolume(hull, config.half_extent, config.sharpness_start)
+    volume = SdfVolume(hull, config.half_extent)
+    volume.refresh()
     keep = []
     for start in range(0, len(blocks), CULL_RAYS // PIXELS):
         part = blocks.take(torch.arange(start, min(start + CULL_RAYS // PIXELS, len(blocks))))
@@ -185,10 +194,8 @@ def _start(
 ) -> _Fit:
     """Parameters and optimiser before the first step."""
     if config.density_model == "sdf":
-        volume: SdfVolume | DensityVolume = SdfVolume(
-            hull, config.half_extent, config.sharpness_start
-        )
-        volume.resample(config.grid_nodes[0])
+        volume: SdfVolume | DensityVolume = SdfVolume(hull, config.half_extent)
+        volume.resample(config.grid_nodes[0], config.coarse_below(config.grid_nodes[0]))
     else:
         volume = DensityVolume(
             HashGridSpec(config.hash_levels, config.hash_log2_entries, 16, config.hash_finest),
@@ -287,16 +294,17 @@ def _optimise(fit: _Fit, blocks: PixelBlocks, config: NerfConfig, ctx: Context) 
         if step % REFRESH_EVERY == 0:
             if ctx.checkpoints.due():
                 ctx.checkpoints.save(step, fit.adam.state() | dict(fit.volume.named_buffers()))
-            fit.volume.refresh(ctx.generator(f"refresh {step}"))
+            if isinstance(fit.volume, SdfVolume):
+                fit.volume.sharpness = config.sharpness_at(step / config.steps)
+            fit.volume.refresh(generator=ctx.generator(f"refresh {step}"))
         batch = _draw(blocks, step, config, ctx)
-        jitter = torch.rand(config.rays_per_step, generator=ctx.generator(f"jitter {step}"))[
-            : batch.pixels.numel()
-        ]
+        draws = torch.rand(batch.pixels.numel(), 3, generator=ctx.generator(f"jitter {step}"))
+        draws = draws.to(ctx.device)
         rendered = render_rays(
             fit.volume,
             fit.materials,
-            batch.rays(),
-            jitter=jitter.to(ctx.device),
+            batch.rays(draws[:, 1:] - 0.5 if config.pixel_jitter else None),
+            jitter=draws[:, 0],
             pyramid=operator(fit.log_environment.exp()),
             min_weight=config.min_weight,
             use_bump=step >= config.bump_start * config.steps,
@@ -318,7 +326,7 @@ def _resume(fit: _Fit, config: NerfConfig, ctx: Context) -> int:
     if saved is None:
         return 0
     step, tensors = saved
-    nodes = tensors.get(f"value.{SDF}")
+    nodes = tensors.get(f"value.{SDF}grid")
     if nodes is not None and isinstance(fit.volume, SdfVolume):
         fit.grow(len(nodes), config)
     fit.adam.load_state(tensors)

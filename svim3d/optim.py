@@ -50,7 +50,7 @@ class NamedAdam:
         name: str,
         parameter: nn.Parameter,
         rate: Rate,
-        carry: Callable[[str, Tensor], Tensor],
+        carry: Callable[[str, Tensor], Tensor] | None = None,
     ) -> None:
         """Put another parameter in a name's place.
 
@@ -58,16 +58,22 @@ class NamedAdam:
             name: whose.
             parameter: the new one.
             rate: its rate.
-            carry: (`exp_avg` or `exp_avg_sq`, old moment) -> moment of the new parameter.
+            carry: (`exp_avg` or `exp_avg_sq`, old moment) -> moment of the new parameter; without
+                it the new parameter starts without a past.
         """
-        old = self.parameters[name]
-        state = self._adam.state.pop(old, None)
+        state = self._adam.state.pop(self.parameters[name], None)
         (group,) = [g for g in self._adam.param_groups if g["name"] == name]
         group["params"] = [parameter]
         self.parameters[name], self._rates[name] = parameter, rate
-        if state:
+        if state and carry is not None:
             carried = {moment: carry(moment, state[moment]) for moment in MOMENTS}
             self._adam.state[parameter] = {"step": state["step"], **carried}
+
+    def remove(self, name: str) -> None:
+        """Forget a parameter."""
+        self._adam.state.pop(self.parameters.pop(name), None)
+        groups = self._adam.param_groups
+        groups[:] = [group for group in groups if group["name"] != name]
 
     def state(self) -> dict[str, Tensor]:
         """Parameters, moments and step counts, detached."""

@@ -6,7 +6,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_
 
 from stages.settings.base import StageConfig
 
-GridNodes = Annotated[int, Field(ge=16, le=512)]
+GridNodes = Annotated[int, Field(ge=4, le=512)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
@@ -28,10 +28,16 @@ class NerfConfig(StageConfig):
     """Masks that may exclude a point of the object by mistake; 1 to 2 for generated views."""
     grid_nodes: tuple[GridNodes, ...] = (64, 96, 128, 192)
     """Nodes per side of the signed-distance grid, coarse to fine; the last is what is returned."""
-    grid_shares: tuple[Share, ...] = (0.0, 0.25, 0.5, 0.7)
+    grid_shares: tuple[Share, ...] = (0.0, 0.4, 0.65, 0.8)
     """Share of the steps at which each grid begins."""
+    coarse_nodes: tuple[GridNodes, ...] = (16, 32)
+    """Nodes per side of coarser grids that are added to the current one, coarse to fine."""
+    coarse_largest: PositiveInt = 96
+    """They are added to grids of at most this many nodes: later the surface is in place."""
     sharpness_start: PositiveFloat = 80.0
     """Inverse width of the opacity transition at the start, per world unit (NeuS: s)."""
+    sharpness_end: PositiveFloat = 1000.0
+    """The same at the end; it rises exponentially."""
     density_threshold: PositiveFloat = 50.0
     """Density of the surface, per world unit (density model only)."""
 
@@ -43,6 +49,8 @@ class NerfConfig(StageConfig):
     """Cells per side of the finest lattice; about one per pixel of the object."""
     hidden: PositiveInt = 32
     """Width of the material network."""
+    pixel_jitter: bool = True
+    """Rays pass anywhere through their pixel, as light did, instead of through its centre."""
     min_weight: Share = 0.02
     """Samples that contribute less to their ray get no material: they cost more than they teach."""
     bump_start: Share = 0.5
@@ -101,3 +109,11 @@ class NerfConfig(StageConfig):
         if list(self.grid_shares) != sorted(self.grid_shares) or self.grid_shares[0] != 0.0:
             raise ValueError(f"grid_shares must rise from 0, got {self.grid_shares}")
         return self
+
+    def sharpness_at(self, done: float) -> float:
+        """Sharpness when a share `done` of the steps has passed."""
+        return float(self.sharpness_start * (self.sharpness_end / self.sharpness_start) ** done)
+
+    def coarse_below(self, nodes: int) -> tuple[int, ...]:
+        """The coarser grids that are added to a grid of `nodes`."""
+        return self.coarse_nodes if nodes <= self.coarse_largest else ()

@@ -18,7 +18,7 @@ Ints = NDArray[np.int64]
 MAX_OPACITY = 1.0 - 1e-6  # keeps the logarithm of what passes finite in the reference
 
 
-def density_opacity(density: Float[Tensor, "N 1"], step: float) -> Float[Tensor, "N 1"]:
+def density_opacity(density: Float[Tensor, "*batch"], step: float) -> Float[Tensor, "*batch"]:
     """Opacity 1 - exp(-density step) of a homogeneous section."""
     return -torch.expm1(-density * step)
 
@@ -27,7 +27,7 @@ def surface_opacity(
     sdf: Float[Tensor, "N 1"],
     slope: Float[Tensor, "N 1"],
     step: float,
-    sharpness: Float[Tensor, ""],
+    sharpness: float,
 ) -> Float[Tensor, "N 1"]:
     """Opacity of a section of a ray through a signed distance.
 

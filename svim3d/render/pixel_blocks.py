@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from svim3d.cameras import Cameras
+from svim3d.numerics import normalize
 from svim3d.render.march import Rays
 
 BLOCK = 2  # pixels per side
@@ -58,11 +59,21 @@ class PixelBlocks:
             {name: values[chosen] for name, values in self.targets.items()},
         )
 
-    def rays(self) -> Rays:
-        """Rays through the pixels' centres, block after block."""
+    def rays(self, offset_px: Float[Tensor, "P 2"] | None = None) -> Rays:
+        """Rays through the pixels, block after block.
+
+        Args:
+            offset_px: where within each pixel, right and down from its centre, in [-0.5, 0.5];
+                random offsets average to what a pixel with a box filter shows.
+        """
         flat = self.pixels.reshape(-1)
         view = flat // (self.cameras.height * self.cameras.width)
         local = self.cameras.pixel_directions(flat % (self.cameras.height * self.cameras.width))
+        if offset_px is not None:
+            # On the plane z = -1 a pixel is 1 / focal wide; image rows run down.
+            shift = offset_px * offset_px.new_tensor([1.0, -1.0]) / self.cameras.focal_px
+            plane = local[:, :2] / -local[:, 2:] + shift
+            local = normalize(torch.cat([plane, -torch.ones_like(plane[:, :1])], -1))
         rotation = self.cameras.c2w[:, :3, :3].index_select(0, view)
         directions = (rotation @ local[..., None])[..., 0]
         return Rays(self.cameras.positions.index_select(0, view), directions)

@@ -5,8 +5,9 @@
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -26,6 +27,7 @@ from svim3d.render.compositing import (
 from svim3d.render.march import EMPTY, SURFACE, Rays, Samples, classify_cells, march
 
 TRANSITION_WIDTHS = 5.0  # beyond 5 widths a logistic transition has less than 1 % left
+START_SHARPNESS = 80.0  # per world unit: a transition of a dozen pixels of the object
 BAND_CELLS = 2.0  # the sampled band reaches at least this far, so that the surface can move
 MIN_STEPS_ACROSS, MAX_STEPS_ACROSS = 96, 256  # samples across the cube, coarse and fine
 OCCUPANCY_CELLS = 64
@@ -52,6 +54,7 @@ class SurfaceSamples:
     coverage: Float[Tensor, "R 1"]
 
 
+@runtime_checkable
 class Volume(Protocol):
     """A trainable distribution of opacity in the cube [-half_extent, half_extent]^3."""
 
@@ -76,43 +79,59 @@ def _keep_heavy(samples: Samples, weights: Float[Tensor, "N 1"], min_weight: flo
 class SdfVolume(nn.Module):
     """Signed distance on a grid, positive inside, with one global transition sharpness.
 
-    Empty space and solid interior are never sampled: only a band around the zero, which must hold
-    the true surface from the start. The visual hull provides that.
+    The distance is the sum of the grid and of coarser grids that start at zero. They let a gradient
+    step move whole regions of the surface at once; without them the fine grid fits the normals by
+    rippling a surface in the wrong place. Empty space and solid interior are never sampled: only a
+    band around the zero, which must hold the true surface from the start. The visual hull does.
     """
 
-    def __init__(self, sdf: Float[Tensor, "n n n"], half_extent: float, sharpness: float) -> None:
+    def __init__(
+        self, sdf: Float[Tensor, "n n n"], half_extent: float, coarse_nodes: Sequence[int] = ()
+    ) -> None:
         super().__init__()
         self.half_extent = half_extent
         self.grid = nn.Parameter(sdf.clone())
-        self.log_sharpness = nn.Parameter(torch.tensor(sharpness, device=sdf.device).log())
-        self.refresh()
+        self.coarse = nn.ParameterList(
+            [nn.Parameter(sdf.new_zeros(nodes, nodes, nodes)) for nodes in coarse_nodes]
+        )
+        self.sharpness = START_SHARPNESS
 
     @property
     def cell(self) -> float:
         """Side of a grid cell, world units."""
         return 2.0 * self.half_extent / (len(self.grid) - 1)
 
+    def distance(self) -> Float[Tensor, "n n n"]:
+        """The signed distance at the nodes of the finest grid."""
+        levels: list[Tensor] = [*self.coarse, self.grid]
+        total = levels[0]
+        for finer in levels[1:]:
+            total = finer + resample_grid(total, len(finer))
+        return total
+
     def refresh(self, generator: torch.Generator | None = None) -> None:
         """Find the band anew; deterministic, so `generator` is not used."""
-        sharpness = float(self.log_sharpness.detach().exp())
-        band = max(TRANSITION_WIDTHS / sharpness, BAND_CELLS * self.cell)
-        self.cells = classify_cells(self.grid.detach(), band)
-        across = min(max(2.0 * self.half_extent * sharpness, MIN_STEPS_ACROSS), MAX_STEPS_ACROSS)
-        self.step = 2.0 * self.half_extent / across
+        band = max(TRANSITION_WIDTHS / self.sharpness, BAND_CELLS * self.cell)
+        self.cells = classify_cells(self.distance().detach(), band)
+        across = 2.0 * self.half_extent * self.sharpness
+        self.step = 2.0 * self.half_extent / min(max(across, MIN_STEPS_ACROSS), MAX_STEPS_ACROSS)
 
-    def resample(self, nodes: int) -> None:
-        """Go to another grid size; the optimiser's moments of the grid are void after it."""
-        self.grid = nn.Parameter(resample_grid(self.grid.detach(), nodes))
-        self.refresh()
+    def resample(self, nodes: int, coarse_nodes: Sequence[int] = ()) -> None:
+        """Go to another grid size with fresh coarse grids; the parameters are new ones."""
+        sdf = resample_grid(self.distance().detach(), nodes)
+        self.grid = nn.Parameter(sdf)
+        self.coarse = nn.ParameterList(
+            [nn.Parameter(sdf.new_zeros(coarse, coarse, coarse)) for coarse in coarse_nodes]
+        )
 
     def trace(self, rays: Rays, jitter: Float[Tensor, "R"], min_weight: float) -> SurfaceSamples:
         """See `Volume`."""
         samples = march(
             rays, self.cells, half_extent=self.half_extent, step=self.step, jitter=jitter
         )
-        sdf, gradient = sample_sdf(self.grid, samples.points, self.half_extent)
+        sdf, gradient = sample_sdf(self.distance(), samples.points, self.half_extent)
         slope = dot(gradient, rays.directions.index_select(0, samples.ray))
-        opacity = surface_opacity(sdf, slope, self.step, self.log_sharpness.exp())
+        opacity = surface_opacity(sdf, slope, self.step, self.sharpness)
         weights = composite_weights(opacity, samples)
         heavy = _keep_heavy(samples, weights, min_weight)
         return SurfaceSamples(
@@ -124,7 +143,7 @@ class SdfVolume(nn.Module):
 
     def signed_distance(self, nodes: int) -> Float[Tensor, "n n n"]:
         """See `Volume`."""
-        return resample_grid(self.grid.detach(), nodes)
+        return resample_grid(self.distance().detach(), nodes)
 
 
 class DensityVolume(nn.Module):
@@ -133,6 +152,7 @@ class DensityVolume(nn.Module):
     Source: Mueller et al. 2022, appendix C, on the visual hull instead of the whole cube.
     """
 
+    hull: Tensor
     occupancy: Tensor
 
     def __init__(
@@ -148,18 +168,19 @@ class DensityVolume(nn.Module):
         self.step = 2.0 * half_extent / MAX_STEPS_ACROSS
         self.field = DensityField(spec, DENSITY_HIDDEN, half_extent)
         sdf = resample_grid(hull, OCCUPANCY_CELLS + 1)
-        self._hull = classify_cells(sdf, 2.0 * half_extent / OCCUPANCY_CELLS) != EMPTY
+        near_hull = classify_cells(sdf, 2.0 * half_extent / OCCUPANCY_CELLS) != EMPTY
+        self.register_buffer("hull", near_hull, persistent=False)
         start = torch.full_like(sdf[1:, 1:, 1:], START_DENSITY)
         self.register_buffer("occupancy", start)
 
     def reset(self, generator: torch.Generator) -> None:
         """Draw the start of the network."""
         self.field.reset(generator)
-        self.cells = torch.where(self._hull, SURFACE, EMPTY).byte()
+        self.cells = torch.where(self.hull, SURFACE, EMPTY).byte()
 
     def refresh(self, generator: torch.Generator) -> None:
         """Decayed running maximum of the density at one random point of each hull cell."""
-        cells = torch.nonzero(self._hull.cpu()).to(self.occupancy.device)
+        cells = torch.nonzero(self.hull)
         offset = torch.rand(cells.shape, generator=generator).to(cells.device)
         points = (cells + offset) * (2.0 * self.half_extent / OCCUPANCY_CELLS) - self.half_extent
         with torch.no_grad():
@@ -167,7 +188,7 @@ class DensityVolume(nn.Module):
         index = tuple(cells.unbind(-1))
         self.occupancy[index] = torch.maximum(self.occupancy[index] * OCCUPANCY_DECAY, density)
         opaque = density_opacity(self.occupancy, self.step) > MIN_OCCUPIED_OPACITY
-        self.cells = torch.where(self._hull & opaque, SURFACE, EMPTY).byte()
+        self.cells = torch.where(self.hull & opaque, SURFACE, EMPTY).byte()
 
     def trace(self, rays: Rays, jitter: Float[Tensor, "R"], min_weight: float) -> SurfaceSamples:
         """See `Volume`."""
@@ -197,11 +218,10 @@ class DensityVolume(nn.Module):
 
     def signed_distance(self, nodes: int) -> Float[Tensor, "n n n"]:
         """See `Volume`: (log density - log threshold) / |gradient| near the surface."""
-        hull = self._hull
         positions = node_positions(nodes, self.half_extent, like=self.occupancy).view(-1, 3)
         with torch.no_grad():
             blocks = [self.field(part) for part in positions.split(NODES_PER_BLOCK)]
         level = torch.cat(blocks).view(nodes, nodes, nodes) - math.log(self.threshold)
         cell = (positions + self.half_extent) * (OCCUPANCY_CELLS / (2.0 * self.half_extent))
         x, y, z = cell.long().clamp(0, OCCUPANCY_CELLS - 1).unbind(-1)
-        return redistance(level.masked_fill(~hull[x, y, z].view_as(level), -1.0), self.half_extent)
+        return redistance(level.masked_fill(~self.hull[x, y, z].view_as(level), -1.0), self.half_extent)

@@ -1,0 +1,180 @@
+"""Phase 1 through `run`: a painted sphere is found again, exactly repeatably; bad input is named."""
+
+import dataclasses
+
+import pytest
+import torch
+from sphere_orbit import RADIUS, sphere_cameras, sphere_images
+
+from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
+from stages.errors import InputError
+from stages.nerf import NERF, run
+from stages.settings.nerf import NerfConfig
+from svim3d.fields.material_field import MaterialField
+from svim3d.fields.sdf_grid import node_positions, sample_sdf
+from svim3d.numerics import normalize
+
+TINY = NerfConfig(
+    steps=60,
+    rays_per_step=512,
+    grid_nodes=(24, 32),
+    grid_shares=(0.0, 0.5),
+    coarse_nodes=(8,),
+    hash_levels=4,
+    hash_log2_entries=11,
+    hash_finest=48,
+    hidden=16,
+    environment_size=16,
+)
+
+
+@pytest.fixture(scope="module")
+def views():
+    cameras = sphere_cameras(views=9, size=48)
+    images = sphere_images(cameras)
+    return MaterialViews(cameras=cameras, reference=len(cameras) - 1, **images)
+
+
+def surface_error(fitted):
+    """Mean distance of near-zero nodes, moved along their gradient, from the sphere."""
+    points = node_positions(len(fitted.sdf), fitted.half_extent, like=fitted.sdf).view(-1, 3)
+    cell = 2 * fitted.half_extent / (len(fitted.sdf) - 1)
+    near = points[fitted.sdf.view(-1).abs() < cell]
+    value, gradient = sample_sdf(fitted.sdf, near, fitted.half_extent)
+    on_surface = near - gradient * value / gradient.square().sum(-1, keepdim=True).clamp_min(0.1)
+    return float((on_surface.norm(dim=-1) - RADIUS).abs().mean())
+
+
+def basecolor_error(fitted):
+    """Mean absolute difference on the sphere, away from the seam of its two colours."""
+    field = MaterialField(fitted.material_spec)
+    field.load_state_dict(fitted.material_state)
+    points = normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0))) * RADIUS
+    seen = (points[:, 1].abs() < 0.3) & (points[:, 0].abs() > 0.05)
+    want = torch.where(points[:, :1] > 0, 0.75, 0.25) * torch.tensor([1.0, 0.5, 0.25])
+    with torch.no_grad():
+        return float((field(points).basecolor - want)[seen].abs().mean())
+
+
+def test_sphere_is_found_with_its_paint_and_a_light(views, make_context):
+    fitted = run(views, None, config=TINY, ctx=make_context("nerf"))
+    # A pixel is 0.028 wide here.
+    assert surface_error(fitted) < 0.006
+    assert basecolor_error(fitted) < 0.05
+    assert fitted.sdf.shape == (32, 32, 32)
+    assert fitted.environment.shape == (16, 16, 3)
+    assert bool((fitted.environment > 0).all())
+    assert bool((fitted.environment != TINY.environment_start).any())
+
+
+def test_density_model_finds_it_too(views, make_context):
+    config = TINY.model_copy(update={"density_model": "density", "steps": 100})
+    fitted = run(views, None, config=config, ctx=make_context("nerf"))
+    assert surface_error(fitted) < 0.03
+    assert basecolor_error(fitted) < 0.08
+
+
+def test_given_light_is_the_start_and_a_rate_of_zero_keeps_it(views, make_context):
+    light = EnvironmentLight(torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0)) + 0.1)
+    config = TINY.model_copy(update={"steps": 4, "environment_rate": 0.0})
+    fitted = run(views, light, config=config, ctx=make_context("nerf"))
+    torch.testing.assert_close(fitted.environment, light.radiance)
+
+
+def equal(a, b):
+    return (
+        torch.equal(a.sdf, b.sdf)
+        and torch.equal(a.environment, b.environment)
+        and all(torch.equal(v, b.material_state[k]) for k, v in a.material_state.items())
+    )
+
+
+@pytest.mark.parametrize("model", ["sdf", "density"])
+def test_killed_and_resumed_run_ends_with_equal_bytes(views, make_context, tmp_path, model):
+    config = TINY.model_copy(update={"steps": 24, "density_model": model})
+    whole = make_context("nerf")
+    whole.checkpoints._every_s = 1e9
+    want = run(views, None, config=config, ctx=whole)
+
+    class Killed(Exception):
+        pass
+
+    def kill(step, *_):
+        if step == 20:
+            raise Killed
+
+    killed = dataclasses.replace(whole, work=tmp_path / "second")
+    killed.checkpoints._every_s = 0.0
+    killed.report = kill
+    with pytest.raises(Killed):
+        run(views, None, config=config, ctx=killed)
+    resumed = dataclasses.replace(whole, work=tmp_path / "second")
+    assert resumed.checkpoints.load()[0] == 16
+    assert equal(run(views, None, config=config, ctx=resumed), want)
+
+
+def test_artifact_survives_the_disk(views, make_context, tmp_path):
+    fitted = run(
+        views, None, config=TINY.model_copy(update={"steps": 2}), ctx=make_context("nerf")
+    )
+    fitted.save(tmp_path)
+    again = FittedField.load(tmp_path)
+    assert equal(fitted, again)
+    assert again.material_spec == fitted.material_spec
+
+
+def test_views_larger_than_the_image_size_are_averaged_down(views, make_context):
+    config = TINY.model_copy(update={"steps": 30, "image_size": 24})
+    assert surface_error(run(views, None, config=config, ctx=make_context("nerf"))) < 0.02
+
+
+def only(views, chosen):
+    images = {
+        f.name: getattr(views, f.name)[chosen]
+        for f in dataclasses.fields(views)
+        if f.name not in ("cameras", "reference")
+    }
+    return MaterialViews(cameras=views.cameras[chosen], reference=0, **images)
+
+
+def test_one_view_is_refused_with_advice(views, make_context):
+    with pytest.raises(InputError, match="at least 3 views .* got 1; give an orbit"):
+        run(only(views, [0]), None, config=TINY, ctx=make_context("nerf"))
+
+
+def test_empty_mask_is_refused_by_number(views, make_context):
+    broken = dataclasses.replace(views, mask=views.mask.clone())
+    broken.mask[4] = 0.0
+    with pytest.raises(InputError, match="mask of view 4 is empty"):
+        run(broken, None, config=TINY, ctx=make_context("nerf"))
+
+
+def test_contradicting_masks_are_refused(views, make_context):
+    corners = torch.zeros_like(views.mask)
+    for view in range(len(corners)):
+        row, column = divmod(view, 3)
+        corners[view, 20 * row : 20 * row + 4, 20 * column : 20 * column + 4] = 1.0
+    broken = dataclasses.replace(views, mask=corners)
+    with pytest.raises(InputError, match="views contradict each other"):
+        run(broken, None, config=TINY, ctx=make_context("nerf"))
+
+
+def test_one_wrong_mask_is_outvoted_and_reported(views, make_context):
+    broken = dataclasses.replace(views, mask=views.mask.clone())
+    broken.mask[2] = 0.0
+    broken.mask[2, :4, :4] = 1.0
+    ctx = make_context("nerf")
+    run(broken, None, config=TINY.model_copy(update={"steps": 2}), ctx=ctx)
+    assert [event["kind"] for event in ctx.events] == ["inconsistent_masks"]
+
+
+def test_schedule_is_checked():
+    with pytest.raises(ValueError, match="pair up"):
+        NerfConfig(grid_nodes=(32,))
+    with pytest.raises(ValueError, match="rise from 0"):
+        NerfConfig(grid_nodes=(32, 64), grid_shares=(0.1, 0.5))
+
+
+def test_stage_declares_its_inputs():
+    assert list(NERF.inputs.values()) == [MaterialViews, EnvironmentLight]
+    assert NERF.output is FittedField

@@ -1,0 +1,75 @@
+"""Visual hull of exact sphere masks, votes against plain torch, wrong masks outvoted."""
+
+import math
+
+import pytest
+import torch
+
+from svim3d.cameras import orbit_angles, orbit_cameras
+from svim3d.fields.sdf_grid import node_positions
+from svim3d.render.hull import coverage_votes, coverage_votes_reference
+
+NODES, HALF_EXTENT, RADIUS = 40, 0.55, 0.4
+
+
+@pytest.fixture(scope="module")
+def orbit():
+    """Cameras all around and the exact masks of a sphere."""
+    angles = orbit_angles(12, 0.0, 50.0)
+    cameras = orbit_cameras(angles, radius=2.5, fov_y_deg=33.8, size=64)
+    masks = []
+    for view in range(len(cameras)):
+        origins, directions = cameras.rays(view)
+        along = -(origins * directions).sum(-1)
+        gap = origins.square().sum(-1) - along.square()
+        masks.append((gap < RADIUS**2).float().view(64, 64))
+    return torch.stack(masks), cameras.clip_from_world()
+
+
+def votes(masks, matrices, rejections=0):
+    return coverage_votes(
+        masks, matrices, nodes=NODES, half_extent=HALF_EXTENT, rejections=rejections
+    )
+
+
+def test_hull_of_a_sphere_contains_it_and_little_more(orbit):
+    hull = votes(*orbit) >= 0.5
+    radius = node_positions(NODES, HALF_EXTENT, like=orbit[0]).norm(dim=-1)
+    pixel = 2.5 / (32 / math.tan(math.radians(16.9)))
+    assert bool(hull[radius < RADIUS - 0.5 * pixel].all())
+    assert not bool(hull[radius > 1.25 * RADIUS].any())
+    cell = (2 * HALF_EXTENT / (NODES - 1)) ** 3
+    volume = float(hull.sum()) * cell
+    # Twelve tangent cones enclose a little more, pixels of a twentieth of the radius a little less.
+    assert 0.97 < volume / (4 / 3 * math.pi * RADIUS**3) < 1.08
+
+
+@pytest.mark.parametrize("rejections", [0, 2])
+def test_kernel_equals_plain_torch(orbit, rejections):
+    masks = torch.rand(orbit[0].shape, generator=torch.Generator().manual_seed(0))
+    got = votes(masks, orbit[1], rejections)
+    want = coverage_votes_reference(masks, orbit[1], NODES, HALF_EXTENT, rejections)
+    torch.testing.assert_close(got, want, atol=1e-4, rtol=0)
+
+
+def test_rejections_outvote_wrong_masks(orbit):
+    masks, matrices = orbit
+    broken = masks.clone()
+    broken[3], broken[7] = 0.0, 0.0
+    assert not bool((votes(broken, matrices, 1) >= 0.5).any())
+    outvoted = votes(broken, matrices, 2) >= 0.5
+    assert bool(outvoted[votes(masks, matrices) >= 0.5].all())
+
+
+def test_points_outside_a_picture_are_not_held_against_the_object(orbit):
+    masks, matrices = orbit
+    cropped = matrices.clone()
+    cropped[0, :2] *= 4.0  # a close-up sees the middle only
+    middle = torch.ones_like(masks)
+    middle[1:] = masks[1:]
+    assert bool((votes(middle, cropped) >= 0.5)[votes(masks, matrices) >= 0.5].all())
+
+
+def test_impossible_number_of_rejections_is_refused(orbit):
+    with pytest.raises(ValueError, match="rejections must lie in"):
+        votes(*orbit, rejections=9)
