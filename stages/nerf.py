@@ -11,7 +11,6 @@ import logging
 from dataclasses import dataclass
 
 import torch
-from svim3d.shading.prefilter import PyramidOperator
 from torch import Tensor, nn
 
 from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
@@ -31,6 +30,7 @@ from svim3d.render.march import hits_surface
 from svim3d.render.pixel_blocks import PIXELS, PixelBlocks
 from svim3d.render.volumes import DensityVolume, SdfVolume
 from svim3d.render.volumetric import Rendered, render_rays
+from svim3d.shading.prefilter import PyramidOperator
 
 SDF, ENVIRONMENT = "volume.", "log_environment"  # names of parameters
 

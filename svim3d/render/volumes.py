@@ -224,4 +224,6 @@ class DensityVolume(nn.Module):
         level = torch.cat(blocks).view(nodes, nodes, nodes) - math.log(self.threshold)
         cell = (positions + self.half_extent) * (OCCUPANCY_CELLS / (2.0 * self.half_extent))
         x, y, z = cell.long().clamp(0, OCCUPANCY_CELLS - 1).unbind(-1)
-        return redistance(level.masked_fill(~self.hull[x, y, z].view_as(level), -1.0), self.half_extent)
+        return redistance(
+            level.masked_fill(~self.hull[x, y, z].view_as(level), -1.0), self.half_extent
+        )

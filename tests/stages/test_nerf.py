@@ -75,7 +75,9 @@ def test_density_model_finds_it_too(views, make_context):
 
 
 def test_given_light_is_the_start_and_a_rate_of_zero_keeps_it(views, make_context):
-    light = EnvironmentLight(torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0)) + 0.1)
+    light = EnvironmentLight(
+        torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0)) + 0.1
+    )
     config = TINY.model_copy(update={"steps": 4, "environment_rate": 0.0})
     fitted = run(views, light, config=config, ctx=make_context("nerf"))
     torch.testing.assert_close(fitted.environment, light.radiance)
@@ -114,9 +116,7 @@ def test_killed_and_resumed_run_ends_with_equal_bytes(views, make_context, tmp_p
 
 
 def test_artifact_survives_the_disk(views, make_context, tmp_path):
-    fitted = run(
-        views, None, config=TINY.model_copy(update={"steps": 2}), ctx=make_context("nerf")
-    )
+    fitted = run(views, None, config=TINY.model_copy(update={"steps": 2}), ctx=make_context("nerf"))
     fitted.save(tmp_path)
     again = FittedField.load(tmp_path)
     assert equal(fitted, again)

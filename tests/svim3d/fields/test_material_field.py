@@ -23,7 +23,7 @@ def test_values_lie_in_their_ranges_and_bump_starts_at_zero():
     with torch.no_grad():
         materials = field(torch.rand(200, 3) * 2.0 - 1.0)
     for value in (materials.basecolor, materials.roughness, materials.metallic):
-        assert 0.0 <= float(value.min()) and float(value.max()) <= 1.0
+        assert float(value.min()) >= 0.0 and float(value.max()) <= 1.0
     assert torch.count_nonzero(materials.bump) == 0
 
 

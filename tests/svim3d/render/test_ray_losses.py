@@ -41,13 +41,9 @@ def test_bilateral_loss_smooths_plain_areas_and_spares_edges():
     plain = torch.zeros(1, 4, 3)
     edge = plain + values
     # Two of the four pairs differ, by one each.
-    torch.testing.assert_close(
-        ray_losses.bilateral_loss(values, plain, mask), torch.tensor(0.5)
-    )
+    torch.testing.assert_close(ray_losses.bilateral_loss(values, plain, mask), torch.tensor(0.5))
     spared = 0.5 * math.exp(-3.0 * math.sqrt(3.0))
-    torch.testing.assert_close(
-        ray_losses.bilateral_loss(values, edge, mask), torch.tensor(spared)
-    )
+    torch.testing.assert_close(ray_losses.bilateral_loss(values, edge, mask), torch.tensor(spared))
     assert float(ray_losses.bilateral_loss(values, plain, 0.0 * mask)) == 0.0
 
 

@@ -44,9 +44,7 @@ def test_sharp_distance_stops_rays_at_the_sphere_with_its_normal():
     volume.refresh()
     rays, jitter = make_rays()
     seen = volume.trace(rays, jitter, 1e-3)
-    torch.testing.assert_close(
-        seen.coverage, torch.ones_like(seen.coverage), atol=2e-3, rtol=0
-    )
+    torch.testing.assert_close(seen.coverage, torch.ones_like(seen.coverage), atol=2e-3, rtol=0)
     error = mean_depth(seen, rays) - exact_hits(rays)
     assert float(error.detach().abs().max()) < 0.5 * volume.cell
     outward = normalize(-seen.gradient)
