@@ -24,6 +24,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -102,8 +103,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.data is None:
         parser.error("--data is needed: no SVIM3D_DATA is set")
-    pairs = dict(item.split("=", 1) for item in arguments.set)
-    settings = EnvPreoptConfig.model_validate_strings(pairs)
+    pairs = (item.split("=", 1) for item in arguments.set)
+    settings = EnvPreoptConfig(**{name: yaml.safe_load(value) for name, value in pairs})
     maps: dict[str, torch.Tensor] = {}
     print(json.dumps(settings.model_dump()), HEADER, sep="\n")
     for asset in arguments.assets:

@@ -13,7 +13,9 @@ Protocol, the same for every asset and preset:
   minus the same for the truth's own materials and normals shaded by our renderer: what is left is
   the asset's fault, not the shading model's.
 - Light: relative L1 error of the recovered map against `env_A.exr`, both blurred to 16 x 32 texels
-  and weighted by solid angle.
+  and weighted by solid angle. One texel of that map holds a lamp of radiance 8920, and bilinear
+  lookup carries a part of it into the next block: the truth itself, stored as an octahedral map and
+  read back, scores 0.23 at 64^2, 0.14 at 128^2 and 0.07 at 256^2.
 """
 
 import json

@@ -79,7 +79,7 @@ IMAGE_TO_ASSET = Pipeline(
         Node("env_preopt", ("generation",), is_skippable=True),
         Node("nerf", ("generation", "env_preopt")),
         Node("dmtet", ("generation", "nerf"), is_skippable=True),
-        Node("uv_bake", ("nerf", "dmtet"), is_skippable=True),
+        Node("uv_bake", ("generation", "nerf", "dmtet"), is_skippable=True),
         Node("export", ("nerf", "dmtet", "uv_bake")),
         Node("preview", ("generation", "nerf", "export"), is_skippable=True),
     ),

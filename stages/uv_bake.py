@@ -1,16 +1,19 @@
 """Phase 3: cleanup, decimation, atlas, and textures baked from the material field.
 
-Reads the surface of phase 2 (or phase 1's own when that was skipped) and the material field, writes
-a `TexturedMesh`. Every texel is projected back onto the original surface, where the field is asked
-and the normal is taken; so decimation costs neither colour nor relief. Method: SViM3D sec. 3.4;
-tangent frames: MikkTSpace; xatlas with a time limit, box projection beyond it.
+Reads the views, the surface of phase 2 (or phase 1's own when that was skipped) and the material
+field, writes a `TexturedMesh`. Every texel is projected back onto the original surface, where the
+field is asked and the normal is taken; so decimation costs little colour and relief. Then
+basecolor, roughness and metallic are sharpened against the views by least squares. Tangent frames:
+MikkTSpace; atlas: xatlas with a time limit, box projection beyond it.
 """
+
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.artifacts import FittedField, RefinedSurface, TexturedMesh
+from stages.artifacts import FittedField, MaterialViews, RefinedSurface, TexturedMesh
 from stages.base import Context, Stage
 from stages.errors import InputError
 from stages.settings.uv_bake import UvBakeConfig
@@ -22,18 +25,21 @@ from svim3d.mesh.projection import project_onto
 from svim3d.mesh.texels import Texels, average_down, rasterize_uv, to_image
 from svim3d.numerics import normalize
 from svim3d.render.occlusion import ambient_occlusion
+from svim3d.render.texture_fit import fit_texels, texel_view
 
 POINTS_PER_CHUNK = 2**17  # bounds the memory of the field's intermediate values
+SOLID = 0.99  # coverage of a pixel that holds no background
 
 
 def run(
+    views: MaterialViews,
     field: FittedField,
     surface: RefinedSurface | None,
     *,
     config: UvBakeConfig,
     ctx: Context,
 ) -> TexturedMesh:
-    """Bake the field onto a mesh.
+    """Bake the field onto a mesh and sharpen its textures against the views.
 
     Raises:
         InputError: there is no surface to bake.
@@ -63,14 +69,14 @@ def run(
     openness = _openness(mesh, field, config.occlusion_rays)
     values = torch.cat([values, texels.interpolate(mesh.faces, openness)], 1)
     values, texels = average_down(values, texels, config.supersample)
+    if config.fit_iterations:
+        values = torch.cat(
+            [_sharpened(mesh, values[:, :5], texels, views, config), values[:, 5:]], 1
+        )
     image = to_image(values, texels)
     ctx.report(4, 4, {"coverage": len(texels.pixel) / texels.size**2})
-    return TexturedMesh(
-        vertices=mesh.vertices,
-        faces=mesh.faces,
-        normals=mesh.normals,
-        uv=mesh.uv,
-        tangents=mesh.tangents,
+    return replace(
+        mesh,
         basecolor=image[..., :3].clamp(0.0, 1.0),
         orm=image[..., [8, 3, 4]].clamp(0.0, 1.0),
         normal_tangent=normalize(image[..., 5:8]),
@@ -147,6 +153,32 @@ def _bake(
             surface = torch.cat([found.basecolor, found.roughness, found.metallic], 1).cpu()
             chunks.append(torch.cat([surface, local], 1))
     return torch.cat(chunks)
+
+
+def _sharpened(
+    mesh: TexturedMesh,
+    baked: Float[Tensor, "P 5"],
+    texels: Texels,
+    views: MaterialViews,
+    config: UvBakeConfig,
+) -> Float[Tensor, "P 5"]:
+    """Texels whose rendered pixels agree with the views; those that no view sees stay as baked.
+
+    Pixels at the rim of the mask are left out, slanted ones count by the cosine squared.
+    """
+    assert mesh.uv is not None
+    seen = texel_view(mesh.vertices, mesh.faces, mesh.uv, views.cameras, texture_size=texels.size)
+    images = torch.cat([views.basecolor, views.roughness, views.metallic, views.mask], -1)
+    target, mask = images.reshape(-1, 6)[seen.pixel].split([5, 1], 1)
+    fitted = fit_texels(
+        seen.operator,
+        target,
+        (mask >= SOLID) * seen.trust.clamp_min(0.0) ** 2,
+        to_image(baked, texels).view(-1, 5),
+        prior=config.fit_prior,
+        iterations=config.fit_iterations,
+    )
+    return fitted[texels.pixel]
 
 
 def _openness(mesh: TexturedMesh, field: FittedField, rays: int) -> Float[Tensor, "N 1"]:

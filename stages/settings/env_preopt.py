@@ -24,7 +24,7 @@ class EnvPreoptConfig(StageConfig):
     """Pixels with less coverage are dropped: at silhouettes they mix two surfaces."""
     min_n_dot_v: float = Field(0.1, ge=0.0, lt=1.0)
     """Pixels seen at a smaller cosine are dropped: split-sum shading is poor at grazing angles."""
-    smooth_weight: float = Field(0.01, ge=0.0)
+    smooth_weight: float = Field(0.03, ge=0.0)
     """Weight of the total variation of log radiance; fills in what no pixel reveals."""
     white_weight: float = Field(0.001, ge=0.0)
     """Weight of the light's departure from grey, in log radiance (nvdiffrec: white balance)."""

@@ -44,3 +44,14 @@ class UvBakeConfig(StageConfig):
         le=4096,
         description="rays per vertex for the occlusion channel; 0: none baked",
     )
+    fit_iterations: int = Field(
+        default=20,
+        ge=0,
+        le=1000,
+        description="conjugate-gradient steps that sharpen the textures against the views; 0: none",
+    )
+    fit_prior: float = Field(
+        default=0.003,
+        gt=0.0,
+        description="pull of a texel towards its baked value, against 1 for a pixel seen head on",
+    )

@@ -2,7 +2,7 @@
 
 Source: xatlas (Young, MIT) for the first. It is super-linear in the number of faces and can hang on
 rough meshes, so it runs in a process of its own that is ended when its time is up. Its charts are
-packed anew here: a third of a thousandth of its texels overlap where a chart folds, and its atlas
+packed anew here: some 0.05 % of its texels overlap where a chart folds, and its atlas
 has another size than was asked for, which would change the gutter.
 """
 

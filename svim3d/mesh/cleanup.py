@@ -21,6 +21,7 @@ from svim3d.mesh.mesh import face_adjacency, face_normals_scaled, signed_volume
 MAX_HOLE_EDGES = 30  # larger openings are taken for the object's own
 # Aggressiveness of the quadric decimation, tried in turn. Measured on a 194k-face test surface to
 # 20k, 10k, 5k faces: 7, the library's default, tears 2, 5, 14 edges; 5 and 3 none; 1 stops at 49k.
+# To 2k faces 5 tears 2 edges, and 3 stops at 3.2k.
 AGGRESSIVENESS = (5.0, 3.0)
 MAX_VOLUME_CHANGE = 0.1  # a decimated mesh off by more than this share has lost parts
 ENOUGH = 1.05  # a mesh with at most this many times the faces asked for is not decimated again

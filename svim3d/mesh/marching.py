@@ -56,7 +56,7 @@ def extract_surface(
 ) -> tuple[Float[Tensor, "N 3"], Int[Tensor, "F 3"]]:
     """Closed surface of a grid over [-half_extent, half_extent]^3, wound outward.
 
-    Where the object touches the border of the cube it is closed within half a cell beyond it.
+    Where the object touches the border of the cube it is closed within a cell of it.
 
     Args:
         sdf: values at the nodes, index order x, y, z; positive inside.

@@ -1,9 +1,12 @@
 """Triangle meshes as tensors: adjacency, normals, areas."""
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
+from svim3d.compiled import kernel
 from svim3d.numerics import normalize
 
 
@@ -37,15 +40,58 @@ def signed_volume(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> 
 def face_adjacency(faces: Int[Tensor, "F 3"]) -> Int[Tensor, "F 3"]:
     """Neighbour across the edge opposite each corner; -1 at a boundary.
 
-    An edge shared by more than two faces links the first pairs in face order.
+    An edge shared by more than two faces links them pairwise in face order.
     """
+    if faces.device.type != "cpu":
+        return face_adjacency_sorted(faces)
+    vertices = int(faces.max()) + 1 if len(faces) else 0
+    return torch.from_numpy(_pair_edges(faces.int().contiguous().numpy(), vertices))
+
+
+def face_adjacency_sorted(faces: Int[Tensor, "F 3"]) -> Int[Tensor, "F 3"]:
+    """`face_adjacency` in plain torch, for any device; the same result."""
     count = faces.shape[0]
     edges = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], 1).reshape(-1, 2)
     low, high = edges.long().sort(1).values.unbind(1)
-    key = low * (int(faces.max()) + 1 if count else 1) + high
-    order = torch.argsort(key, stable=True)
-    paired = torch.nonzero(key[order[1:]] == key[order[:-1]])[:, 0]
+    key, order = torch.sort(low * (int(faces.max()) + 1 if count else 1) + high, stable=True)
+    place = torch.arange(len(key), device=faces.device)
+    repeats = torch.zeros_like(key, dtype=torch.bool)
+    repeats[1:] = key[1:] == key[:-1]
+    rank = place - torch.where(repeats, 0, place).cummax(0).values
+    second = torch.nonzero(repeats & (rank % 2 == 1))[:, 0]
     neighbours = torch.full((3 * count,), -1, dtype=torch.int32, device=faces.device)
-    neighbours[order[paired]] = (order[paired + 1] // 3).int()
-    neighbours[order[paired + 1]] = (order[paired] // 3).int()
+    neighbours[order[second]] = (order[second - 1] // 3).int()
+    neighbours[order[second - 1]] = (order[second] // 3).int()
     return neighbours.view(count, 3)
+
+
+@kernel()
+def _pair_edges(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
+    """Bucket half-edges by their lower vertex, then match equal ones within each bucket."""
+    start = np.zeros(vertices + 1, np.int64)
+    for f in range(faces.shape[0]):
+        for k in range(3):
+            start[min(faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]) + 1] += 1
+    for v in range(vertices):
+        start[v + 1] += start[v]
+    filled = start[:vertices].copy()
+    open_edges = np.empty(3 * faces.shape[0], np.int64)
+    neighbours = np.full((faces.shape[0], 3), -1, np.int32)
+    for f in range(faces.shape[0]):
+        for k in range(3):
+            a, b = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+            low, high = min(a, b), max(a, b)
+            matched = False
+            for slot in range(start[low], filled[low]):
+                g, m = open_edges[slot] // 3, open_edges[slot] % 3
+                if max(faces[g, (m + 1) % 3], faces[g, (m + 2) % 3]) == high:
+                    neighbours[f, k], neighbours[g, m] = g, f
+                    # Matched edges leave the bucket, so that most searches are short.
+                    filled[low] -= 1
+                    open_edges[slot] = open_edges[filled[low]]
+                    matched = True
+                    break
+            if not matched:
+                open_edges[filled[low]] = 3 * f + k
+                filled[low] += 1
+    return neighbours

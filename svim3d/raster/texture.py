@@ -1,8 +1,30 @@
 """Texture reading in glTF's convention."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+
+
+def bilinear_taps(
+    uv: Float[Tensor, "P 2"], height: int, width: int
+) -> tuple[Int[Tensor, "P 4"], Float[Tensor, "P 4"]]:
+    """Flat indices and weights of the four texels around each coordinate.
+
+    Weights are differentiable in `uv`; coordinates outside [0, 1] repeat.
+    """
+    position = (uv - uv.detach().floor()) * uv.new_tensor([width, height]) - 0.5
+    corner = position.detach().floor()
+    fraction = position - corner
+    column, row = corner.long().unbind(1)
+    right, below = (column + 1) % width, (row + 1) % height
+    column, row = column % width, row % height
+    index = torch.stack(
+        [row * width + column, row * width + right, below * width + column, below * width + right],
+        1,
+    )
+    fx, fy = fraction.unbind(1)
+    weights = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], 1)
+    return index, weights
 
 
 def sample_texture(
@@ -14,17 +36,6 @@ def sample_texture(
     and coordinates outside [0, 1] repeat. Source: glTF 2.0, section 3.8.4 (default sampler).
     """
     height, width, channels = texture.shape
-    size = uv.new_tensor([width, height])
-    position = (uv - uv.detach().floor()) * size - 0.5
-    corner = position.detach().floor()
-    fraction = position - corner
-    column, row = corner.long().unbind(1)
-    right, below = (column + 1) % width, (row + 1) % height
-    column, row = column % width, row % height
-    texels = texture.reshape(-1, channels)
-    index = torch.stack([row * width + column, row * width + right], 1)
-    index = torch.cat([index, torch.stack([below * width + column, below * width + right], 1)], 1)
-    corners = texels.index_select(0, index.reshape(-1)).view(-1, 4, channels)
-    fx, fy = fraction.unbind(1)
-    weights = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], 1)
-    return (weights[..., None] * corners).sum(1)
+    index, weights = bilinear_taps(uv, height, width)
+    corners = texture.reshape(-1, channels).index_select(0, index.reshape(-1))
+    return (weights[..., None] * corners.view(-1, 4, channels)).sum(1)

@@ -104,7 +104,7 @@ def _occlusion(
     for i in prange(points.shape[0]):
         origin = (points[i] + half_extent) * scale
         n = normals[i]
-        # Frame about the normal. Source: Duff et al. 2017, eq. 4.
+        # Orthonormal frame about the normal, without a branch. Source: Duff et al. 2017.
         sign = 1.0 if n[2] >= 0.0 else -1.0
         a = -1.0 / (sign + n[2])
         b = n[0] * n[1] * a

@@ -5,6 +5,7 @@ own copy of the pyramid's gradient, so that the result does not depend on the nu
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,15 +33,14 @@ def fused_shade(
 ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
     """Diffuse and specular radiance; differentiable in everything, arguments as in `shade`."""
     layout = pyramid.layout
-    constants = (
-        split_sum_table(normal.device, normal.dtype).numpy(),
+    levels = (
         torch.tensor(layout.roughness, dtype=normal.dtype).numpy(),
         np.array((*layout.sizes, layout.irradiance_size)),
         np.array(layout.offsets),
-        multiple_scattering,
     )
+    settings = (split_sum_table(normal.device, normal.dtype).numpy(), multiple_scattering)
     points = (normal, wo, basecolor, roughness, metallic, pyramid.texels)
-    shaded: tuple[Tensor, Tensor] = _Shade.apply(constants, *points)  # type: ignore[no-untyped-call]
+    shaded: tuple[Tensor, Tensor] = _Shade.apply(levels, settings, *points)  # type: ignore[no-untyped-call]
     return shaded
 
 
@@ -48,32 +48,41 @@ class _Shade(torch.autograd.Function):
     """Forward and backward kernels as one differentiable operation."""
 
     @staticmethod
-    def forward(ctx: Any, constants: tuple[Any, ...], *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        contiguous = tuple(t.detach().contiguous() for t in inputs)
-        ctx.constants, ctx.texels_wanted = constants, inputs[-1].requires_grad
+    def forward(
+        ctx: Any, levels: tuple[Any, ...], settings: tuple[Any, bool], *inputs: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        contiguous = [t.detach().contiguous() for t in inputs]
+        ctx.levels, ctx.settings = levels, settings
+        ctx.texels_wanted = inputs[-1].requires_grad
         ctx.save_for_backward(*contiguous)
-        diffuse, specular = torch.empty_like(contiguous[0]), torch.empty_like(contiguous[0])
-        arguments: list[Any] = [t.numpy() for t in contiguous]
-        arguments += [*constants, diffuse.numpy(), specular.numpy()]
-        shade_forward(*arguments)
-        return diffuse, specular
+        shaded = torch.empty_like(contiguous[0]), torch.empty_like(contiguous[0])
+        *points, texels = contiguous
+        shade_forward(_arrays(points), (texels.numpy(), *levels), *settings, _arrays(shaded))
+        return shaded
 
     @staticmethod
-    def backward(
-        ctx: Any, grad_diffuse: Tensor, grad_specular: Tensor
-    ) -> tuple[Tensor | None, ...]:
-        inputs: tuple[Tensor, ...] = ctx.saved_tensors
-        gradients = [torch.empty_like(t) for t in inputs[:-1]]
-        texels = inputs[-1]
-        chunks = _chunk_count(len(inputs[0]))
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        *points, texels = ctx.saved_tensors
+        table, multiple_scattering = ctx.settings
+        gradients = [torch.empty_like(t) for t in points]
         # Without a wanted gradient the copies are empty, which the kernel understands.
+        chunks = _chunk_count(len(points[0]))
         copies = texels.new_zeros(chunks, len(texels) if ctx.texels_wanted else 0, 3)
-        arguments: list[Any] = [t.numpy() for t in inputs]
-        arguments += ctx.constants
-        arguments += [g.contiguous().numpy() for g in (grad_diffuse, grad_specular)]
-        arguments += [g.numpy() for g in (*gradients, copies)]
-        shade_backward(*arguments)
-        return None, *gradients, copies.sum(0) if ctx.texels_wanted else None
+        shade_backward(
+            _arrays(points),
+            (texels.numpy(), *ctx.levels),
+            table,
+            multiple_scattering,
+            _arrays([g.contiguous() for g in upstream]),
+            _arrays(gradients),
+            copies.numpy(),
+        )
+        return None, None, *gradients, copies.sum(0) if ctx.texels_wanted else None
+
+
+def _arrays(tensors: Sequence[Tensor]) -> Any:
+    """The tensors' memory as a tuple of arrays."""
+    return tuple(t.numpy() for t in tensors)
 
 
 def _chunk_count(points: int) -> int:

@@ -17,27 +17,24 @@ from svim3d.shading.metallic_roughness import DIELECTRIC_F0
 from svim3d.shading.octahedral import MIN_L1_NORM
 
 Array = NDArray[Any]
+Points = tuple[Array, Array, Array, Array, Array]  # normal, view, base colour, roughness, metallic
+Pyramid = tuple[Array, Array, Array, Array]  # texels, roughness knots, sizes and offsets of levels
 Triple = tuple[float, float, float]
 Taps = tuple[int, int, int, int, float, float]
 
 
 @kernel(parallel=True)
 def shade_forward(
-    normal: Array,
-    wo: Array,
-    basecolor: Array,
-    roughness: Array,
-    metallic: Array,
-    texels: Array,
+    points: Points,
+    pyramid: Pyramid,
     table: Array,
-    knots: Array,
-    sizes: Array,
-    offsets: Array,
     multiple_scattering: bool,
-    diffuse: Array,
-    specular: Array,
+    shaded: tuple[Array, Array],
 ) -> None:
-    """One point per iteration."""
+    """Write diffuse and specular radiance; one point per iteration."""
+    normal, wo, basecolor, roughness, metallic = points
+    texels, knots, sizes, offsets = pyramid
+    diffuse, specular = shaded
     last = len(knots)
     for p in numba.prange(len(normal)):
         r, m = float(roughness[p, 0]), float(metallic[p, 0])
@@ -62,31 +59,22 @@ def shade_forward(
 
 @kernel(parallel=True)
 def shade_backward(
-    normal: Array,
-    wo: Array,
-    basecolor: Array,
-    roughness: Array,
-    metallic: Array,
-    texels: Array,
+    points: Points,
+    pyramid: Pyramid,
     table: Array,
-    knots: Array,
-    sizes: Array,
-    offsets: Array,
     multiple_scattering: bool,
-    grad_diffuse: Array,
-    grad_specular: Array,
-    grad_normal: Array,
-    grad_wo: Array,
-    grad_basecolor: Array,
-    grad_roughness: Array,
-    grad_metallic: Array,
+    upstream: tuple[Array, Array],
+    gradients: Points,
     grad_texels: Array,
 ) -> None:
-    """One chunk of points per iteration, each with its own copy of `grad_texels`."""
-    points, chunks, last = len(normal), len(grad_texels), len(knots)
-    wanted = grad_texels.shape[1] > 0
+    """Write the derivatives by the points; add those by the texels, one copy per chunk."""
+    normal, wo, basecolor, roughness, metallic = points
+    texels, knots, sizes, offsets = pyramid
+    grad_diffuse, grad_specular = upstream
+    grad_normal, grad_wo, grad_basecolor, grad_roughness, grad_metallic = gradients
+    count, chunks, last = len(normal), len(grad_texels), len(knots)
     for chunk in numba.prange(chunks):
-        for p in range(chunk * points // chunks, (chunk + 1) * points // chunks):
+        for p in range(chunk * count // chunks, (chunk + 1) * count // chunks):
             r, m = float(roughness[p, 0]), float(metallic[p, 0])
             raw, n_dot_v, dx, dy, dz = _directions(normal[p], wo[p], r)
             scale, bias, scale_v, bias_v, scale_r, bias_r = _table_lookup(table, n_dot_v, r)
@@ -104,17 +92,10 @@ def shade_backward(
                 irradiance, around_u, around_v = _fetch(
                     texels, offsets[last], around, sizes[last], c
                 )
+                light = (low + fraction * (high - low), irradiance, fraction)
+                g_shaded = (grad_diffuse[p, c], grad_specular[p, c])
                 g_low, g_high, g_irradiance, g_base, g_metal, g_a, g_b = _channel_adjoint(
-                    basecolor[p, c],
-                    m,
-                    scale,
-                    bias,
-                    multiple_scattering,
-                    low + fraction * (high - low),
-                    irradiance,
-                    fraction,
-                    grad_diffuse[p, c],
-                    grad_specular[p, c],
+                    basecolor[p, c], m, (scale, bias), multiple_scattering, light, g_shaded
                 )
                 grad_basecolor[p, c] = g_base
                 g_m, g_scale, g_bias = g_m + g_metal, g_scale + g_a, g_bias + g_b
@@ -123,21 +104,17 @@ def shade_backward(
                 g_v += g_low * low_v + g_high * high_v
                 g_around_u += g_irradiance * around_u
                 g_around_v += g_irradiance * around_v
-                if wanted:
+                if grad_texels.shape[1] > 0:
                     _scatter(grad_texels[chunk], offsets[level], sharp, c, g_low)
                     _scatter(grad_texels[chunk], offsets[level + 1], blurred, c, g_high)
                     _scatter(grad_texels[chunk], offsets[last], around, c, g_irradiance)
-            bounded = MIN_N_DOT_V <= raw <= 1.0
-            g_dot = g_scale * scale_v + g_bias * bias_v if bounded else 0.0
+            g_dot = g_scale * scale_v + g_bias * bias_v if MIN_N_DOT_V <= raw <= 1.0 else 0.0
             g_direction = _square_adjoint(dx, dy, dz, g_u, g_v)
+            nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
+            g_around = _square_adjoint(nx, ny, nz, g_around_u, g_around_v)
             g_bend = _direction_adjoint(
-                normal[p], wo[p], raw, r, g_direction, g_dot, grad_normal[p], grad_wo[p]
+                normal[p], wo[p], raw, r, g_direction, g_around, g_dot, grad_normal[p], grad_wo[p]
             )
-            g_around = _square_adjoint(
-                normal[p, 0], normal[p, 1], normal[p, 2], g_around_u, g_around_v
-            )
-            for k in range(3):
-                grad_normal[p, k] += g_around[k]
             g_r = g_scale * scale_r + g_bias * bias_r + g_fraction * slope
             grad_roughness[p, 0] = g_r + g_bend * 3.0 * r * r
             grad_metallic[p, 0] = g_m
@@ -155,16 +132,18 @@ def _bounces(f0: float, single: float, evenly_lit: float) -> float:
 def _channel_adjoint(
     base: float,
     m: float,
-    scale: float,
-    bias: float,
+    table: tuple[float, float],
     multiple_scattering: bool,
-    radiance: float,
-    irradiance: float,
-    fraction: float,
-    g_diffuse: float,
-    g_specular: float,
+    light: Triple,
+    g_shaded: tuple[float, float],
 ) -> tuple[float, float, float, float, float, float, float]:
-    """Derivatives by both levels' radiance, irradiance, base colour, metallic, A and B."""
+    """Derivatives by both levels' radiance, irradiance, base colour, metallic, A and B.
+
+    `light` holds prefiltered radiance, irradiance, and the fraction between the levels.
+    """
+    scale, bias = table
+    radiance, irradiance, fraction = light
+    g_diffuse, g_specular = g_shaded
     f0, albedo = DIELECTRIC_F0 * (1.0 - m) + base * m, base * (1.0 - m)
     single, multiple, gain = f0 * scale + bias, 0.0, 0.0
     escaped = 1.0 - (scale + bias)
@@ -202,6 +181,7 @@ def _direction_adjoint(
     raw: float,
     r: float,
     g_direction: Triple,
+    g_around: Triple,
     g_dot: float,
     grad_normal: Array,
     grad_wo: Array,
@@ -217,7 +197,8 @@ def _direction_adjoint(
         g_dot += 2.0 * (1.0 - bend) * g_direction[k] * normal[k]
     for k in range(3):
         g_mirror = (1.0 - bend) * g_direction[k]
-        grad_normal[k] = bend * g_direction[k] + 2.0 * raw * g_mirror + g_dot * wo[k]
+        g_straight = bend * g_direction[k] + 2.0 * raw * g_mirror
+        grad_normal[k] = g_straight + g_around[k] + g_dot * wo[k]
         grad_wo[k] = g_dot * normal[k] - g_mirror
     return g_bend
 

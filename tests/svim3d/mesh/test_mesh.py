@@ -4,6 +4,7 @@ import torch
 
 from svim3d.mesh.mesh import (
     face_adjacency,
+    face_adjacency_sorted,
     face_normals_scaled,
     signed_volume,
     vertex_normals,
@@ -44,3 +45,14 @@ def test_adjacency_is_mutual_and_complete_on_a_closed_mesh():
 
 def test_adjacency_marks_boundaries():
     assert face_adjacency(FACES[:1]).tolist() == [[-1, -1, -1]]
+
+
+def test_an_edge_of_three_faces_links_the_first_two():
+    fan = torch.tensor([[0, 1, 2], [1, 0, 3], [0, 1, 4]])
+    assert face_adjacency(fan)[:, 2].tolist() == [1, 0, -1]
+
+
+def test_the_sorted_twin_gives_the_same_adjacency():
+    soup = torch.randint(0, 12, (60, 3), generator=torch.Generator().manual_seed(0))
+    for faces in (FACES, FACES[:5], soup, FACES[:0]):
+        assert torch.equal(face_adjacency(faces), face_adjacency_sorted(faces))

@@ -26,14 +26,15 @@ def test_a_convex_body_sees_the_whole_sky():
 
 def test_the_foot_of_a_wall_sees_half_of_it():
     # Floor y < -0.3 and wall x < -0.3: at the wall's foot all directions with x < 0 are blocked,
-    # as far as the grid reaches; at distance d and wall height h the share is (1 - h / s) / 2 + ...
+    # as far as the grid reaches.
     points = node_positions(96, HALF, like=torch.zeros(1))
     sdf = torch.maximum(-0.3 - points[..., 1], -0.3 - points[..., 0])
     up = torch.tensor([[0.0, 1, 0]])
     near = torch.tensor([[-0.28, -0.3, 0.0]])
     found = ambient_occlusion(near, up, sdf, half_extent=HALF, rays=2000)
     # Form factor of an infinitely long wall of height h from a floor point at distance d:
-    # (1 - d / sqrt(d^2 + h^2)) / 2. Source: Howell, catalogue of configuration factors, B-71.
+    # (1 - d / sqrt(d^2 + h^2)) / 2, that is (1 - cosine of the wall's elevation seen from there)
+    # / 2; so d -> 0 gives one half.
     d, h = 0.02, HALF + 0.3
     expected = 1 - (1 - d / (d * d + h * h) ** 0.5) / 2
     assert float(found) == pytest.approx(expected, abs=0.03)

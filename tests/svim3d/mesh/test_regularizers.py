@@ -1,0 +1,53 @@
+import math
+
+import pytest
+import torch
+
+from svim3d.mesh.mesh import face_adjacency
+from svim3d.mesh.regularizers import laplacian_loss, normal_consistency_loss, sign_change_loss
+
+OCTAHEDRON = torch.tensor(
+    [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=torch.float64
+)
+FACES = torch.tensor(
+    [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
+)
+
+
+def softplus(x: float) -> float:
+    return math.log1p(math.exp(x))
+
+
+def test_sign_change_of_one_edge_is_two_logistic_losses():
+    sdf = torch.tensor([0.7, -0.3, 5.0], dtype=torch.float64, requires_grad=True)
+    loss = sign_change_loss(sdf, torch.tensor([[0, 1]]))
+    assert float(loss.detach()) == pytest.approx(softplus(0.7) + softplus(0.3))
+    (gradient,) = torch.autograd.grad(loss, sdf)
+    assert float(gradient[0]) > 0 > float(gradient[1])  # descent pulls both towards zero
+    assert float(gradient[2]) == 0
+
+
+def test_the_laplacian_of_an_octahedron_is_one():
+    # The four neighbours of each vertex have their mean at the centre, one away.
+    assert float(laplacian_loss(OCTAHEDRON, FACES)) == pytest.approx(1.0)
+    assert float(laplacian_loss(3.0 * OCTAHEDRON, FACES)) == pytest.approx(9.0)
+
+
+def test_normal_consistency_is_one_minus_the_cosine_of_the_dihedral_angle():
+    # Neighbouring faces of a regular octahedron have normals with cosine 1/3.
+    loss = normal_consistency_loss(OCTAHEDRON, FACES, face_adjacency(FACES))
+    assert float(loss) == pytest.approx(2 / 3)
+    flat = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    quad = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    assert float(normal_consistency_loss(flat, quad, face_adjacency(quad))) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("name", ["laplacian", "normals"])
+def test_gradients_match_finite_differences(name: str):
+    noise = 0.1 * torch.randn(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    vertices = (OCTAHEDRON + noise).requires_grad_()
+    losses = {
+        "laplacian": lambda v: laplacian_loss(v, FACES),
+        "normals": lambda v: normal_consistency_loss(v, FACES, face_adjacency(FACES)),
+    }
+    assert torch.autograd.gradcheck(losses[name], (vertices,))
