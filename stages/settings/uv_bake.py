@@ -51,7 +51,7 @@ class UvBakeConfig(StageConfig):
         description="conjugate-gradient steps that sharpen the textures against the views; 0: none",
     )
     fit_prior: float = Field(
-        default=0.003,
+        default=0.015,
         gt=0.0,
         description="pull of a texel towards its baked value, against 1 for a pixel seen head on",
     )
