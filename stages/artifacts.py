@@ -11,7 +11,7 @@ from typing import Self
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import adaptive_avg_pool2d
 
 from svim3d.cameras import Cameras
 from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
@@ -52,8 +52,8 @@ class MaterialViews:
         """What an optimisation compares renders with: images times coverage, cameras to match.
 
         Args:
-            longest_px: larger views are averaged down by a whole factor to at most this size; rows
-                and columns that do not fill a block are cut.
+            longest_px: larger views are averaged down to at most this size; the whole picture stays
+                in view.
         """
         planes = {
             "mask": self.mask,
@@ -64,12 +64,9 @@ class MaterialViews:
             "normal_world": normalize(self.normal_world) * self.mask,
         }
         factor = -(-max(self.cameras.height, self.cameras.width) // longest_px)
+        height, width = self.cameras.height // factor, self.cameras.width // factor
         if factor > 1:
-            planes = {
-                name: avg_pool2d(plane.permute(0, 3, 1, 2), factor).permute(0, 2, 3, 1).contiguous()
-                for name, plane in planes.items()
-            }
-        height, width = planes["mask"].shape[1:3]
+            planes = {name: _averaged(plane, height, width) for name, plane in planes.items()}
         return self.cameras.resized(height, width), planes
 
     def save(self, folder: Path) -> None:
@@ -98,6 +95,12 @@ class MaterialViews:
         """Number and size of the views."""
         views, height, width, _ = self.radiance.shape
         return f"{views} views of {width} x {height}"
+
+
+def _averaged(images: Tensor, height: int, width: int) -> Tensor:
+    """Area means of channel-last images."""
+    pooled = adaptive_avg_pool2d(images.permute(0, 3, 1, 2), (height, width))
+    return pooled.permute(0, 2, 3, 1).contiguous()
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,8 @@ from svim3d.io.orbit import read_orbit
 from svim3d.io.orbit_repair import admit_views
 from svim3d.io.scene import read_scene
 from svim3d.mesh.source_mesh import SourceMesh
-from svim3d.render.pictures import environment_shader, render_pictures
+from svim3d.render.deferred import environment_shader
+from svim3d.render.pictures import render_pictures
 from svim3d.shading.environment import octahedral_from_latlong, physical_radiance
 from svim3d.shading.octahedral import texel_directions
 from svim3d.shading.prefilter import PyramidOperator

@@ -22,7 +22,6 @@ from svim3d.fields.distance import signed_distance, without_hidden_parts
 from svim3d.fields.hash_grid import HashGridSpec
 from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
 from svim3d.fields.sdf_grid import resample_grid
-from svim3d.numerics import normalize
 from svim3d.optim import NamedAdam, Rate
 from svim3d.render import ray_losses
 from svim3d.render.hull import INSIDE_COVERAGE, coverage_votes
@@ -103,30 +102,6 @@ def _rate(name: str, config: NerfConfig) -> Rate:
     if name == ENVIRONMENT:
         return Rate(config.environment_rate, eps=ENVIRONMENT_EPS)
     return Rate(config.network_rate if ".network." in name else config.field_rate)
-
-
-def _image_planes(views: MaterialViews, size: int, device: torch.device) -> dict[str, Tensor]:
-    """The views' images, premultiplied by the mask and averaged down to at most `size`."""
-    mask = views.mask
-    planes = {
-        "mask": mask,
-        "radiance": views.radiance,
-        "basecolor": views.basecolor * mask,
-        "roughness": views.roughness * mask,
-        "metallic": views.metallic * mask,
-        "normal": normalize(views.normal_world) * mask,
-    }
-    factor = -(-max(mask.shape[1:3]) // size)
-    return {name: _average(plane, factor).to(device) for name, plane in planes.items()}
-
-
-def _average(images: Tensor, factor: int) -> Tensor:
-    """Mean over about factor x factor pixels; the whole picture stays in view."""
-    if factor == 1:
-        return images
-    size = (images.shape[1] // factor, images.shape[2] // factor)
-    pooled = torch.nn.functional.adaptive_avg_pool2d(images.permute(0, 3, 1, 2), size)
-    return pooled.permute(0, 2, 3, 1).contiguous()
 
 
 def _check(views: MaterialViews) -> None:
@@ -250,7 +225,7 @@ def _losses(
             torch.cat([blocks(rendered.roughness), blocks(rendered.metallic)], -1),
             torch.cat([target["roughness"], target["metallic"]], -1),
         ),
-        "normal": normal_weight * ray_losses.absolute_loss(normal, target["normal"]),
+        "normal": normal_weight * ray_losses.absolute_loss(normal, target["normal_world"]),
         "normal_smoothness": config.normal_smoothness_weight
         * ray_losses.bilateral_loss(straight, target["guide"], both),
         "depth_smoothness": config.depth_smoothness_weight
@@ -270,7 +245,7 @@ def _losses(
         )
     if done >= config.bump_start:
         terms["bump_normal"] = config.bump_normal_weight * ray_losses.absolute_loss(
-            blocks(rendered.normal_shading), target["normal"]
+            blocks(rendered.normal_shading), target["normal_world"]
         )
         terms["bump_size"] = config.bump_size_weight * ray_losses.size_loss(rendered.bump)
     return terms
@@ -358,9 +333,9 @@ def run(
         InputError: fewer than three views, an empty mask, or masks that share no point.
     """
     _check(views)
-    planes = _image_planes(views, config.image_size, ctx.device)
-    height, width = planes["mask"].shape[1:3]
-    cameras = views.cameras.to(ctx.device).resized(height, width)
+    cameras, planes = views.premultiplied(config.image_size)
+    cameras = cameras.to(ctx.device)
+    planes = {name: plane.to(ctx.device) for name, plane in planes.items()}
     hull = _hull(planes["mask"], cameras, config, ctx)
     planes["guide"] = ray_losses.tonemap(planes["radiance"])
     blocks = _pixel_blocks(cameras, planes, hull, config)

@@ -23,7 +23,8 @@ from svim3d.io.exr import read_rgb
 from svim3d.io.glb import read_mesh
 from svim3d.io.image import Label, read_png, with_labels, write_png
 from svim3d.metrics import mean_angle_deg, psnr
-from svim3d.render.pictures import environment_shader, render_pictures
+from svim3d.render.deferred import environment_shader
+from svim3d.render.pictures import render_pictures
 from svim3d.shading.environment import latlong_from_octahedral, octahedral_from_latlong
 from svim3d.shading.prefilter import PyramidOperator
 from svim3d.shading.tonemap import agx

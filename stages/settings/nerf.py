@@ -76,9 +76,9 @@ class NerfConfig(StageConfig):
 
     mask_weight: NonNegativeFloat = 0.3
     """Cross-entropy of coverage."""
-    basecolor_weight: NonNegativeFloat = 3.0
+    basecolor_weight: NonNegativeFloat = 6.0
     """Absolute difference in sRGB."""
-    orm_weight: NonNegativeFloat = 1.5
+    orm_weight: NonNegativeFloat = 3.0
     """Absolute difference of roughness and metallic."""
     normal_weight: NonNegativeFloat = 1.0
     """Absolute difference of geometric normals at the start."""

@@ -21,8 +21,6 @@ from svim3d.render.deferred import (
     normal_from_tangent,
     render_mesh,
 )
-from svim3d.shading.prefilter import EnvironmentPyramid
-from svim3d.shading.split_sum import shade
 
 ATTRIBUTES = {"uv": 2, "tangent": 4, "color": 3}
 
@@ -58,23 +56,6 @@ def render_pictures(
     ]
     names = ("radiance", "mask", "basecolor", "roughness", "metallic", "normal_world")
     return {name: torch.stack([getattr(view, name) for view in views]) for name in names}
-
-
-def environment_shader(pyramid: EnvironmentPyramid, *, multiple_scattering: bool = True) -> Shader:
-    """Shade by a prefiltered environment, without visibility."""
-
-    def radiance(normal: Tensor, wo: Tensor, materials: Materials) -> Tensor:
-        return shade(
-            normal,
-            wo,
-            materials.basecolor,
-            materials.roughness,
-            materials.metallic,
-            pyramid,
-            multiple_scattering=multiple_scattering,
-        ).radiance
-
-    return radiance
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ import torch
 from svim3d.cameras import orbit_cameras
 from svim3d.mesh.source_mesh import SourceMaterial, SourceMesh
 from svim3d.numerics import normalize
-from svim3d.render.pictures import environment_shader, render_pictures
+from svim3d.render.deferred import environment_shader
+from svim3d.render.pictures import render_pictures
 from svim3d.shading.prefilter import PyramidOperator
 
 
