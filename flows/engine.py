@@ -21,7 +21,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from stages.errors import TransientError
+from stages.errors import InputError, TransientError
 
 STARTUP_TIMEOUT_S = 120.0  # a new data base takes 20 s on a busy machine
 STOP_TIMEOUT_S = 5.0
@@ -60,9 +60,19 @@ class Engine:
         self.waited_s = 0.0
 
     def __enter__(self) -> Self:
-        """Set Prefect's environment and start the server; returns before it is ready."""
+        """Set Prefect's environment and start the server; returns before it is ready.
+
+        Raises:
+            InputError: if the home cannot be made.
+        """
         # Prefect makes its home, but not the folder above; that failure would show as a time-out.
-        self._home.mkdir(parents=True, exist_ok=True)
+        try:
+            self._home.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"the store cannot be written: no folder {self._home} ({error.strerror}); "
+                "mend its permissions or choose another --store"
+            ) from error
         os.environ.update(SETTINGS | {"PREFECT_HOME": str(self._home)})
         if self._url is None:
             self._is_new = not (self._home / DATABASE).exists()

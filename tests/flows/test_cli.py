@@ -127,3 +127,10 @@ def test_run_that_the_store_can_answer_loads_neither_torch_nor_prefect(tmp_path,
 
 def test_example_is_shipped():
     assert cli.main(["plan"]) == cli.DONE
+
+
+def test_store_that_cannot_be_written_is_refused_before_the_engine_starts(source, tmp_path, capsys):
+    (tmp_path / "file").write_text("in the way")
+    given = ["run", str(source), "--store", str(tmp_path / "file" / "store")]
+    assert tiny_command.main(given) == cli.BAD_INPUT
+    assert "choose another --store" in capsys.readouterr().err
