@@ -66,7 +66,10 @@ def load_config(
         path, value = _parse_override(override)
         _require_known(schema, path, origin="--set")
         _set(values, path, value)
-    values["skip"] = sorted({*values.get("skip", ()), *skip})
+    left_out = values.get("skip", [])
+    if not isinstance(left_out, list):
+        raise InputError(f"--set skip={left_out}: wanted a list of stages, like skip=[dmtet]")
+    values["skip"] = [*left_out, *skip]
     try:
         return schema.model_validate(values)
     except ValidationError as error:

@@ -81,12 +81,20 @@ def test_preset_gives_way_to_overrides(monkeypatch):
         ("fit=3", "fit: input should be a valid dictionary.*got 3"),
         ("fit.steps", "write it as stage.name=value"),
         ("fit.steps=[1", "is no YAML"),
+        ("skip=refine", r"--set skip=refine: wanted a list of stages, like skip=\[dmtet\]"),
+        ("skip=3", "wanted a list of stages"),
     ],
 )
 def test_wrong_overrides_are_named_with_their_cure(override, complaint):
     with pytest.raises(InputError, match=complaint) as caught:
         load(override)
     assert "\n" not in str(caught.value)
+
+
+def test_what_a_preset_leaves_out_can_be_brought_back(monkeypatch):
+    monkeypatch.setattr(config_module, "_read_preset", lambda _: {"skip": ["refine"]})
+    assert load("skip=[]").skip == frozenset()
+    assert load("skip=[]", skip=("fit",)).skip == {"fit"}
 
 
 def test_wrong_preset_key_is_named_with_the_nearest(monkeypatch):
