@@ -9,6 +9,7 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import json
+import urllib.parse
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -102,10 +103,16 @@ def _digests_with_referred(file: Path) -> list[str]:
         if neighbours is None:
             neighbours = list(_visible_files(file.parent))
         text = current.read_bytes()
-        named = [n for n in neighbours if n not in seen and n.name.encode() in text]
+        named = [n for n in neighbours if n not in seen and _is_named(n.name, text)]
         seen.update(named)
         queue.extend(named)
     return [digest_file(file), *(digest_file(f) for f in sorted(seen - {file}))]
+
+
+def _is_named(name: str, text: bytes) -> bool:
+    """Whether a file's text names another: as it is, as glTF's URIs do, or as JSON may."""
+    spellings = (name, urllib.parse.quote(name), json.dumps(name)[1:-1])
+    return any(spelling.encode() in text for spelling in spellings)
 
 
 def library_versions() -> dict[str, str]:

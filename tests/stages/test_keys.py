@@ -129,6 +129,16 @@ def test_mesh_digest_covers_the_files_that_it_names(tmp_path):
     assert digest_input(mesh) != first
 
 
+@pytest.mark.parametrize("spelling", ["rust 1ä.png", "rust%201%C3%A4.png", "rust 1\\u00e4.png"])
+def test_mesh_digest_covers_files_by_any_spelling_of_their_name(tmp_path, spelling):
+    mesh = tmp_path / "chair.gltf"
+    mesh.write_text(f'{{"images": [{{"uri": "{spelling}"}}]}}', encoding="utf-8")
+    (tmp_path / "rust 1ä.png").write_bytes(b"brown")
+    first = digest_input(mesh)
+    (tmp_path / "rust 1ä.png").write_bytes(b"red")
+    assert digest_input(mesh) != first
+
+
 def test_absent_input_is_refused(tmp_path):
     with pytest.raises(InputError, match="does not exist; give an orbit folder"):
         digest_input(tmp_path / "nowhere")
