@@ -83,7 +83,8 @@ def run(request: Request) -> int:
     # A stop by the system must leave the same resumable state as Ctrl-C.
     signal.signal(signal.SIGTERM, _interrupt)
     store = Store(
-        request.store, say=lambda text: console.print(text, style="yellow", highlight=False)
+        request.store,
+        say=lambda text: console.print(text, style="yellow", highlight=False, markup=False),
     )
     plan = request.plan(store)
     if plan.to_compute:

@@ -7,6 +7,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -63,9 +64,9 @@ class RunDisplay:
         if name in self._bar_of:  # tried again
             self._bars.reset(self._bar_of[name])
             return
-        self._bar_of[name] = self._bars.add_task(name, total=None, note=step.reason)
+        self._bar_of[name] = self._bars.add_task(name, total=None, note=escape(step.reason))
         if not self._console.is_terminal:
-            self._console.print(f"{name}: computing ({step.reason})", highlight=False)
+            self._tell(f"{name}: computing ({step.reason})")
 
     def progressed(self, progress: "StageProgress") -> None:
         """Move a stage's bar."""
@@ -78,17 +79,21 @@ class RunDisplay:
 
     def failed(self, step: Step, error: BaseException) -> None:
         """Name a fault; the engine decides whether the stage is tried again."""
-        self._console.print(f"{step.node.name}: {type(error).__name__}: {error}", style="yellow")
+        self._tell(f"{step.node.name}: {type(error).__name__}: {error}", style="yellow")
 
     def finished(self, step: Step, stored: Stored) -> None:
         """Fill a stage's bar."""
         headline = stored.manifest.record["headline"]
         if step.node.name in self._bar_of:
             bar = self._bar_of[step.node.name]
-            self._bars.update(bar, completed=1, total=1, note=headline)
+            self._bars.update(bar, completed=1, total=1, note=escape(headline))
         if not self._console.is_terminal:
             how = "cached" if stored.is_cached else f"{stored.manifest.record['seconds']:.1f} s"
-            self._console.print(f"{step.node.name}: {how}, {headline}", highlight=False)
+            self._tell(f"{step.node.name}: {how}, {headline}")
+
+    def _tell(self, text: str, style: str | None = None) -> None:
+        """Print a line as it is: brackets in messages are no markup."""
+        self._console.print(text, style=style, highlight=False, markup=False)
 
 
 class _ConsoleHandler(logging.Handler):
@@ -97,7 +102,7 @@ class _ConsoleHandler(logging.Handler):
         self._console = console
 
     def emit(self, record: logging.LogRecord) -> None:
-        self._console.print(self.format(record), style="yellow", highlight=False)
+        self._console.print(self.format(record), style="yellow", highlight=False, markup=False)
 
 
 @contextlib.contextmanager
@@ -120,7 +125,7 @@ def plan_table(plan: Plan) -> Table:
     for step in plan.steps:
         verdict = "hit" if step.verdict is Verdict.CACHED else str(step.verdict)
         verdict = "miss" if step.verdict is Verdict.COMPUTE and step.stored is None else verdict
-        table.add_row(step.node.name, step.key8, verdict, step.reason)
+        table.add_row(step.node.name, step.key8, verdict, escape(step.reason))
     return table
 
 
@@ -143,8 +148,8 @@ def result_table(plan: Plan, artifacts: Mapping[str, Stored]) -> Table:
             f"{record['seconds']:.1f}" if record else "",
             f"{record['peak_memory_mib']['host']:.0f}" if record else "",
             step.key8,
-            record["headline"] if record else "",
+            escape(record["headline"]) if record else "",
         )
         for event in record["events"] if record else ():
-            table.add_row("", "", "", "", "", f"[yellow]{event['message']}")
+            table.add_row("", "", "", "", "", f"[yellow]{escape(event['message'])}")
     return table

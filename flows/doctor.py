@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from stages.store import Store
@@ -24,7 +25,7 @@ def doctor(root: Path) -> int:
     table = Table(box=None, pad_edge=False, show_header=False)
     problems = []
     for name, finding, is_fine in [*_machine(root), *_installation(), *_store(Store(root))]:
-        table.add_row(name, finding if is_fine else f"[red]{finding}")
+        table.add_row(name, escape(finding) if is_fine else f"[red]{escape(finding)}")
         if not is_fine:
             problems.append(name)
     console = Console()
