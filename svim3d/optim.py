@@ -90,8 +90,7 @@ class NamedAdam:
                 parameter.copy_(tensors[f"value.{name}"])
                 keys = [key for key in ("step", *MOMENTS) if f"{key}.{name}" in tensors]
                 if keys:
-                    state = {key: tensors[f"{key}.{name}"].clone() for key in keys}
+                    # Fused Adam counts its steps on the parameter's device.
                     self._adam.state[parameter] = {
-                        key: value if key == "step" else value.to(parameter.device)
-                        for key, value in state.items()
+                        key: tensors[f"{key}.{name}"].clone().to(parameter.device) for key in keys
                     }

@@ -1,5 +1,6 @@
 """Named Adam: equal to torch's, replaceable parameters, complete state."""
 
+import pytest
 import torch
 from torch import nn
 
@@ -24,14 +25,19 @@ def test_steps_equal_torch_adam():
     torch.testing.assert_close(ours, theirs)
 
 
-def test_state_restores_bit_for_bit():
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_state_restores_bit_for_bit(device):
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+
     def make():
-        return NamedAdam({"a": nn.Parameter(torch.zeros(4))}, {"a": Rate(0.1)})
+        return NamedAdam({"a": nn.Parameter(torch.zeros(4, device=device))}, {"a": Rate(0.1)})
 
     first, second = make(), make()
     for _ in range(3):
         quadratic_step(first)
-    second.load_state({name: t.clone() for name, t in first.state().items()})
+    # As a checkpoint gives it back: on the CPU.
+    second.load_state({name: t.cpu().clone() for name, t in first.state().items()})
     for adam in (first, second):
         quadratic_step(adam)
     assert torch.equal(first.parameters["a"], second.parameters["a"])
