@@ -111,7 +111,8 @@ def _job_options() -> argparse.ArgumentParser:
         nargs="?",
         default="example",
         metavar="INPUT",
-        help="an orbit folder, a .glb, .gltf or .obj file, or the word 'example' (the default)",
+        help="an orbit folder, a .glb, .gltf or .obj file, a scene file (.json), or the word "
+        "'example' (the default)",
     )
     job.add_argument(
         "-o", "--output", type=Path, metavar="OUT", help="run folder (out/<name of the input>)"

@@ -72,7 +72,9 @@ def digest_input(path: Path) -> str:
         InputError: if there is nothing at `path`, or it cannot be read.
     """
     if not path.exists():
-        raise InputError(f"input {path} does not exist; give an orbit folder or a mesh file")
+        raise InputError(
+            f"input {path} does not exist; give an orbit folder, a mesh or a scene file"
+        )
     try:
         if path.is_dir():
             return digest_json({"files": _digests(path, _visible_files(path))})

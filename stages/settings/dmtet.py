@@ -41,7 +41,7 @@ class DmtetConfig(StageConfig):
     mask_weight: NonNegativeFloat = 1.0
     """Squared difference of coverage."""
     basecolor_weight: NonNegativeFloat = 1.0
-    """Absolute difference in sRGB."""
+    """Squared difference in sRGB."""
     orm_weight: NonNegativeFloat = 0.5
     """Absolute difference of roughness and metallic."""
     normal_weight: NonNegativeFloat = 0.5

@@ -25,7 +25,8 @@ class NerfConfig(StageConfig):
     half_extent: PositiveFloat = 0.55
     """Half the side of the cube that holds the object, world units."""
     hull_rejections: Annotated[int, Field(ge=0, le=7)] = 0
-    """Masks that may exclude a point of the object by mistake; 1 to 2 for generated views."""
+    """Masks that may exclude a point of the object by mistake; 1 to 2 for generated views. Where
+    that leaves no hull, up to two more are tried and an event says so."""
     grid_nodes: tuple[GridNodes, ...] = (64, 96, 128, 192)
     """Nodes per side of the signed-distance grid, coarse to fine; the last is what is returned."""
     grid_shares: tuple[Share, ...] = (0.0, 0.4, 0.65, 0.8)
@@ -64,7 +65,7 @@ class NerfConfig(StageConfig):
     """Give back the energy that rough metals lose to single scattering (Fdez-Aguera 2019)."""
 
     field_rate: PositiveFloat = 1e-2
-    """Adam step of hash grid and transition sharpness; Source: Mueller et al. 2022."""
+    """Adam step of the hash grids; Source: Mueller et al. 2022."""
     network_rate: PositiveFloat = 5e-3
     """Adam step of the networks."""
     sdf_rate: PositiveFloat = 0.06
@@ -77,9 +78,9 @@ class NerfConfig(StageConfig):
     mask_weight: NonNegativeFloat = 0.3
     """Cross-entropy of coverage."""
     basecolor_weight: NonNegativeFloat = 6.0
-    """Absolute difference in sRGB."""
+    """Squared difference in sRGB."""
     orm_weight: NonNegativeFloat = 3.0
-    """Absolute difference of roughness and metallic."""
+    """Squared difference of roughness and metallic."""
     normal_weight: NonNegativeFloat = 1.0
     """Absolute difference of geometric normals at the start."""
     normal_weight_end: NonNegativeFloat = 0.3
