@@ -23,6 +23,14 @@ import torch
 from stages.base import Context
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what needs a GPU where there is none: README's command runs every test."""
+    if not torch.cuda.is_available():
+        for item in items:
+            if item.get_closest_marker("gpu"):
+                item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+
+
 @pytest.fixture
 def make_context(tmp_path: Path) -> Callable[..., Context]:
     """`make_context("nerf")`: a context of that stage in a folder of its own.

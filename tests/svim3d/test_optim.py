@@ -27,9 +27,6 @@ def test_steps_equal_torch_adam():
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def test_state_restores_bit_for_bit(device):
-    if device == "cuda" and not torch.cuda.is_available():
-        pytest.skip("needs a CUDA device")
-
     def make():
         return NamedAdam({"a": nn.Parameter(torch.zeros(4, device=device))}, {"a": Rate(0.1)})
 
