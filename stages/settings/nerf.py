@@ -37,7 +37,7 @@ class NerfConfig(StageConfig):
     """They are added to grids of at most this many nodes: later the surface is in place."""
     sharpness_start: PositiveFloat = 80.0
     """Inverse width of the opacity transition at the start, per world unit (NeuS: s)."""
-    sharpness_end: PositiveFloat = 1000.0
+    sharpness_end: PositiveFloat = 2000.0
     """The same at the end; it rises exponentially."""
     density_threshold: PositiveFloat = 12.0
     """Density of the surface, per world unit (density model only)."""
@@ -83,7 +83,7 @@ class NerfConfig(StageConfig):
     """Squared difference of roughness and metallic."""
     normal_weight: NonNegativeFloat = 1.0
     """Absolute difference of geometric normals at the start."""
-    normal_weight_end: NonNegativeFloat = 0.3
+    normal_weight_end: NonNegativeFloat = 0.7
     """The same at the end: normals lead at first, as in the paper."""
     bump_normal_weight: NonNegativeFloat = 0.5
     """Absolute difference of shading normals, once the bump is fitted."""
