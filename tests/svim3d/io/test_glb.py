@@ -6,6 +6,7 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import pygltflib
 import pytest
 import torch
 import trimesh
@@ -76,7 +77,6 @@ def test_basecolor_is_stored_with_the_srgb_curve_and_orm_without():
 
 
 def test_pygltflib_finds_attributes_materials_and_sampler():
-    pygltflib = pytest.importorskip("pygltflib")
     asset = quad()
     document = pygltflib.GLTF2.load_from_bytes(glb_bytes(**asset))
     primitive = document.meshes[0].primitives[0]
