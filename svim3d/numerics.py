@@ -1,6 +1,5 @@
 """Guarded elementary operations shared by the whole library."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -38,8 +37,3 @@ def smoothstep(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Hermite step 3x^2 - 2x^3 of `x` clamped to [0, 1]."""
     t = saturate(x)
     return t * t * (3.0 - 2.0 * t)
-
-
-def finite_or(x: Tensor, fallback: float) -> Tensor:
-    """Replace NaN and both infinities by `fallback`."""
-    return torch.nan_to_num(x, nan=fallback, posinf=fallback, neginf=fallback)

@@ -1,12 +1,9 @@
-"""Priors on surfaces under optimisation: few sign changes, even triangles, no creases."""
+"""Priors on surfaces under optimisation: few sign changes, even triangles."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
-
-from svim3d.mesh.mesh import face_normals_scaled
-from svim3d.numerics import normalize
 
 
 def sign_change_loss(sdf: Float[Tensor, "N"], edges: Int[Tensor, "E 2"]) -> Float[Tensor, ""]:
@@ -32,16 +29,3 @@ def laplacian_loss(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) ->
     summed = torch.zeros_like(vertices).index_add(0, start, vertices.index_select(0, end))
     degree = torch.bincount(start, minlength=len(vertices)).clamp_min(1).to(vertices.dtype)
     return (summed / degree[:, None] - vertices).square().sum(1).mean()
-
-
-def normal_consistency_loss(
-    vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"], adjacency: Int[Tensor, "F 3"]
-) -> Float[Tensor, ""]:
-    """Mean over shared edges of 1 - cos of the angle between the two faces."""
-    normals = normalize(face_normals_scaled(vertices, faces))
-    face, side = torch.nonzero(
-        adjacency > torch.arange(len(faces), device=faces.device)[:, None], as_tuple=True
-    )
-    beyond = adjacency[face, side].long()
-    cosine = (normals.index_select(0, face) * normals.index_select(0, beyond)).sum(1)
-    return (1.0 - cosine).mean()

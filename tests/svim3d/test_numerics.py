@@ -28,8 +28,3 @@ def test_smoothstep_values_and_clamps():
     x = torch.tensor([-1.0, 0.0, 0.25, 0.5, 1.0, 2.0])
     expected = torch.tensor([0.0, 0.0, 0.15625, 0.5, 1.0, 1.0])
     assert torch.equal(numerics.smoothstep(x), expected)
-
-
-def test_finite_or_replaces_only_non_finite():
-    x = torch.tensor([1.0, float("nan"), float("inf"), -float("inf")])
-    assert torch.equal(numerics.finite_or(x, 7.0), torch.tensor([1.0, 7.0, 7.0, 7.0]))
