@@ -328,7 +328,8 @@ def _uv_transform(extension: Json) -> NDArray[np.float64]:
 
 
 def _tensor(values: NDArray[Any]) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+    # A copy: packed float attributes are views into the file's bytes, which cannot be written.
+    return torch.from_numpy(np.array(values, np.float32, order="C"))
 
 
 def _unit(vectors: Tensor) -> Tensor:
