@@ -90,7 +90,10 @@ def _page(plan: Plan, artifacts: Mapping[str, Stored], about: Mapping[str, Any])
             "reason": step.reason,
             "key": step.recipe.key if step.recipe else None,
             "bytes": stored.manifest.size if stored else None,
-            **{name: record.get(name) for name in ("seconds", "headline", "peak_memory_mib")},
+            **{
+                name: record.get(name)
+                for name in ("seconds", "headline", "peak_memory_mib", "device")
+            },
             "events": record.get("events", []),
         }
     return {
