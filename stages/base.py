@@ -59,10 +59,12 @@ class Checkpoints:
         folder: Path,
         every_s: float = CHECKPOINT_EVERY_S,
         before_save: Callable[[], None] | None = None,
+        after_load: Callable[[], None] | None = None,
     ) -> None:
         self._file = folder / "checkpoint.safetensors"
         self._every_s = every_s
         self._before_save = before_save
+        self._after_load = after_load
         self._last_s = time.monotonic()
 
     @property
@@ -90,11 +92,14 @@ class Checkpoints:
             return None
         try:
             tensors = load_tensors(self._file)
-            return int(tensors.pop("__step__")), tensors
+            step = int(tensors.pop("__step__"))
         except Exception as error:  # of any kind: a damaged checkpoint costs time, nothing else
             log.warning("checkpoint %s is unreadable (%s): starting anew", self._file, error)
             self._file.unlink()
             return None
+        if self._after_load is not None:
+            self._after_load()
+        return step, tensors
 
 
 @dataclass
@@ -121,7 +126,13 @@ class Context:
 
     def __post_init__(self) -> None:
         self.work.mkdir(parents=True, exist_ok=True)
-        self.checkpoints = Checkpoints(self.work, before_save=self._flush_scalars)
+        self.checkpoints = Checkpoints(
+            self.work,
+            before_save=self._flush_scalars,
+            after_load=lambda: self.event(
+                "resumed", "went on from a checkpoint of an interrupted run"
+            ),
+        )
         self._scalars: typing.TextIO | None = None
         self._last_progress_s = -math.inf
         self._event_log = self.work / "events.jsonl"

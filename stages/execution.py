@@ -65,8 +65,6 @@ def run_stage(
         with Context(
             recipe.stage, device, recipe.seed, work, store.shared, on_progress=on_progress
         ) as ctx:
-            if ctx.checkpoints.exists:
-                ctx.event("resumed", "went on from a checkpoint of an interrupted run")
             artifact: Artifact = stage.run(*_load(stage, inputs), config=config, ctx=ctx)
             artifact.save(payload)
         return {

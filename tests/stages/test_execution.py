@@ -7,7 +7,7 @@ from typing import Self
 import pytest
 import torch
 
-from stages.base import Context, Stage
+from stages.base import Checkpoints, Context, Stage
 from stages.errors import InputError
 from stages.execution import choose_device, run_stage
 from stages.keys import Recipe
@@ -67,21 +67,28 @@ def test_stages_chain_through_the_store(tmp_path):
     assert run_stage(store, recipe("join"), Stage(join), both, **options).is_cached
 
 
-def test_resumed_stage_says_so(tmp_path):
+def resume(source: Path, *, config: StageConfig, ctx: Context) -> Text:
+    return Text("new" if ctx.checkpoints.load() is None else "resumed")
+
+
+@pytest.mark.parametrize("is_sound", [True, False])
+def test_resumed_stage_says_so_and_one_that_had_to_start_anew_does_not(tmp_path, is_sound):
     store = Store(tmp_path)
-    work = store.work(recipe("read").key)
-    work.mkdir(parents=True)
-    (work / "checkpoint.safetensors").write_bytes(b"whatever")
-    (tmp_path / "in.txt").write_text("ab")
+    work = store.work(recipe("resume").key)
+    Checkpoints(work).save(7, {"x": torch.zeros(3)})
+    if not is_sound:
+        (work / "checkpoint.safetensors").write_bytes(b"whatever")
     stored = run_stage(
         store,
-        recipe("read"),
-        Stage(read),
-        {"source": tmp_path / "in.txt"},
+        recipe("resume"),
+        Stage(resume),
+        {"source": tmp_path},
         config=StageConfig(),
         device=CPU,
     )
-    assert stored.manifest.record["events"][0]["kind"] == "resumed"
+    assert Text.load(stored.folder).value == ("resumed" if is_sound else "new")
+    kinds = [event["kind"] for event in stored.manifest.record["events"]]
+    assert kinds == (["resumed"] if is_sound else [])
 
 
 def test_device_is_chosen_by_what_there_is():
