@@ -82,7 +82,7 @@ class _Fit:
         """
         assert isinstance(self.volume, SdfVolume)
         ratio = (len(self.volume.grid) / nodes) ** 3
-        self.volume.resample(nodes, config.coarse_below(nodes))
+        self.volume.resample(nodes, _coarse_below(nodes, config))
         rate = Rate(config.sdf_rate * self.volume.cell)
         fresh = {f"{VOLUME}{n}": p for n, p in self.volume.named_parameters()}
         for name in [n for n in self.adam.parameters if n.startswith(VOLUME) and n not in fresh]:
@@ -95,6 +95,17 @@ class _Fit:
             rate,
             lambda moment, old: resample_grid(old, nodes) * ratio ** MOMENT_POWER[moment],
         )
+
+
+# What is computed from settings stays here: their own modules are no part of an artifact's key.
+def _sharpness_at(done: float, config: NerfConfig) -> float:
+    """Sharpness when a share `done` of the steps has passed."""
+    return float(config.sharpness_start * (config.sharpness_end / config.sharpness_start) ** done)
+
+
+def _coarse_below(nodes: int, config: NerfConfig) -> tuple[int, ...]:
+    """The coarser grids that are added to a grid of `nodes`."""
+    return config.coarse_nodes if nodes <= config.coarse_largest else ()
 
 
 def _rate(name: str, config: NerfConfig) -> Rate:
@@ -167,7 +178,7 @@ def _start_volume(hull: Tensor, config: NerfConfig, ctx: Context) -> SdfVolume |
     """The density model that was asked for, filling the hull."""
     if config.density_model == "sdf":
         surface = SdfVolume(hull, config.half_extent)
-        surface.resample(config.grid_nodes[0], config.coarse_below(config.grid_nodes[0]))
+        surface.resample(config.grid_nodes[0], _coarse_below(config.grid_nodes[0], config))
         return surface
     spec = HashGridSpec(
         config.hash_levels, config.hash_log2_entries, config.hash_coarsest, config.hash_finest
@@ -270,7 +281,7 @@ def _optimise(fit: _Fit, blocks: PixelBlocks, config: NerfConfig, ctx: Context) 
             if ctx.checkpoints.due():
                 ctx.checkpoints.save(step, fit.adam.state() | dict(fit.volume.named_buffers()))
             if isinstance(fit.volume, SdfVolume):
-                fit.volume.sharpness = config.sharpness_at(step / config.steps)
+                fit.volume.sharpness = _sharpness_at(step / config.steps, config)
             fit.volume.refresh(generator=ctx.generator(f"refresh {step}"))
         batch = _draw(blocks, step, config, ctx)
         jitter = torch.rand(batch.pixels.numel(), generator=ctx.generator(f"jitter {step}"))

@@ -163,6 +163,16 @@ def test_planning_stays_light(module):
                 queue.append(name)
 
 
+@pytest.mark.parametrize("module", [m for m in MODULES if is_within(m, ("stages.settings",))])
+def test_settings_hold_values_and_compute_nothing(module):
+    # They are left out of the code in an artifact's key: a formula here could change unseen.
+    for node in ast.walk(TREES[module]):
+        if isinstance(node, ast.FunctionDef):
+            checks = {"field_validator", "model_validator"}
+            decorators = {ast.unparse(d).partition("(")[0] for d in node.decorator_list}
+            assert decorators & checks, f"{module}.{node.name} belongs into the stage"
+
+
 @pytest.mark.parametrize("module", [m for m in MODULES if is_within(m, ("svim3d",))])
 def test_library_sees_tensors_only(module):
     if not is_within(module, FILE_DOORS):

@@ -110,11 +110,3 @@ class NerfConfig(StageConfig):
         if list(self.grid_shares) != sorted(self.grid_shares) or self.grid_shares[0] != 0.0:
             raise ValueError(f"grid_shares must rise from 0, got {self.grid_shares}")
         return self
-
-    def sharpness_at(self, done: float) -> float:
-        """Sharpness when a share `done` of the steps has passed."""
-        return float(self.sharpness_start * (self.sharpness_end / self.sharpness_start) ** done)
-
-    def coarse_below(self, nodes: int) -> tuple[int, ...]:
-        """The coarser grids that are added to a grid of `nodes`."""
-        return self.coarse_nodes if nodes <= self.coarse_largest else ()
