@@ -15,7 +15,7 @@ from rich.table import Table
 from stages.store import Store
 
 DONE, FAILED = 0, 1
-LIBRARIES = ("torch", "numpy", "numba", "kornia", "OpenEXR", "pymeshlab", "xatlas", "prefect")
+LIBRARIES = ("torch", "numpy", "numba", "OpenEXR", "pymeshlab", "xatlas", "prefect")
 # What the pipeline can do without; distribution and module names are the same.
 OPTIONAL = {"matplotlib": "charts of the benchmarks", "pytest": "the tests"}
 

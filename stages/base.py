@@ -86,6 +86,10 @@ class Checkpoints:
         temporary.replace(self._file)
         self._last_s = time.monotonic()
 
+    def discard(self) -> None:
+        """Forget the half-done work."""
+        self._file.unlink(missing_ok=True)
+
     def load(self) -> tuple[int, dict[str, Tensor]] | None:
         """The step to go on with and its state, or None at the beginning."""
         if not self.exists:
@@ -95,7 +99,7 @@ class Checkpoints:
             step = int(tensors.pop("__step__"))
         except Exception as error:  # of any kind: a damaged checkpoint costs time, nothing else
             log.warning("checkpoint %s is unreadable (%s): starting anew", self._file, error)
-            self._file.unlink()
+            self.discard()
             return None
         if self._after_load is not None:
             self._after_load()
@@ -200,10 +204,11 @@ class Context:
             self._scalars.flush()
 
     def is_finite(self, step: int, terms: Mapping[str, Tensor]) -> bool:
-        """Whether all loss terms are finite; a bad step is counted and should be skipped.
+        """Whether all terms are finite; a bad step is counted and should be skipped.
 
         Raises:
-            DivergenceError: after `MAX_NON_FINITE_STEPS` bad steps.
+            DivergenceError: after `MAX_NON_FINITE_STEPS` bad steps; what was checkpointed is
+                forgotten, so that the next attempt starts anew.
         """
         bad = [name for name, value in terms.items() if not bool(torch.isfinite(value).all())]
         if not bad:
@@ -211,6 +216,8 @@ class Context:
         self.event(NON_FINITE_STEP, f"step {step} skipped: non-finite {', '.join(bad)}")
         skipped = sum(entry["kind"] == NON_FINITE_STEP for entry in self.events)
         if skipped > MAX_NON_FINITE_STEPS:
+            self.checkpoints.discard()
+            self._event_log.unlink(missing_ok=True)
             raise DivergenceError(
                 f"{self.stage}: more than {MAX_NON_FINITE_STEPS} steps had a non-finite "
                 f"{', '.join(bad)}; lower the learning rate or check the input for NaN"

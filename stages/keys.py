@@ -21,7 +21,18 @@ from stages.errors import InputError
 OUR_PACKAGES = frozenset({"svim3d", "stages"})
 # Settings are left out of the code: their resolved values are in the key already.
 SETTINGS_PACKAGE = "stages.settings"
-NUMERIC_LIBRARIES = ("torch", "numba", "numpy")  # a new release of these may change results
+# A new release of these may change results.
+NUMERIC_LIBRARIES = (
+    "torch",
+    "numba",
+    "numpy",
+    "scipy",
+    "OpenEXR",
+    "pillow",
+    "xatlas",
+    "pymeshlab",
+    "fast-simplification",
+)
 SKIPPED_INPUT = "none"
 # Meshes that name further files beside them, which belong to the input as much as they do.
 REFERRING_SUFFIXES = frozenset({".obj", ".mtl", ".gltf"})

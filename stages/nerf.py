@@ -299,9 +299,9 @@ def _optimise(fit: _Fit, blocks: PixelBlocks, config: NerfConfig, ctx: Context) 
         if ctx.is_finite(step, terms):
             fit.adam.zero_grad()
             torch.stack(list(terms.values())).sum().backward()
-            fit.adam.step(
-                config.final_rate ** (step / config.steps) * min(1.0, (step + 1) / WARM_UP)
-            )
+            if ctx.is_finite(step, fit.adam.gradients()):
+                warm = min(1.0, (step + 1) / WARM_UP)
+                fit.adam.step(config.final_rate ** (step / config.steps) * warm)
         ctx.report(step + 1, config.steps, {name: float(t.detach()) for name, t in terms.items()})
 
 

@@ -39,6 +39,11 @@ class NamedAdam:
         """Forget the gradients."""
         self._adam.zero_grad(set_to_none=True)
 
+    def gradients(self) -> dict[str, Tensor]:
+        """Sum of each parameter's gradient: finite unless some entry is not."""
+        named = self.parameters.items()
+        return {f"gradient of {n}": p.grad.sum() for n, p in named if p.grad is not None}
+
     def step(self, share: float) -> None:
         """One step at `share` of every rate."""
         for group in self._adam.param_groups:

@@ -83,8 +83,12 @@ def test_non_finite_steps_are_skipped_then_fatal_by_name(make_context):
     assert ctx.is_finite(0, {"rgb": torch.tensor(1.0)})
     for step in range(MAX_NON_FINITE_STEPS):
         assert not ctx.is_finite(step, bad)
+    ctx.checkpoints.save(3, {"x": torch.ones(1)})
     with pytest.raises(DivergenceError, match="non-finite rgb; lower the learning rate"):
         ctx.is_finite(MAX_NON_FINITE_STEPS, bad)
+    # The next attempt must not take up what has diverged.
+    assert not ctx.checkpoints.exists
+    assert not (ctx.work / "events.jsonl").exists()
 
 
 def test_progress_is_told_sparingly_and_at_the_end(make_context):

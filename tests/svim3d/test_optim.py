@@ -53,3 +53,12 @@ def test_replaced_parameter_carries_its_moments_and_removed_one_is_gone():
     quadratic_step(adam)
     assert set(adam.parameters) == {"a"}
     assert float(b.detach()) == kept
+
+
+def test_one_bad_entry_shows_in_its_parameters_gradient():
+    good, bad = nn.Parameter(torch.ones(3)), nn.Parameter(torch.zeros(3))
+    adam = NamedAdam({"good": good, "bad": bad}, {"good": Rate(0.1), "bad": Rate(0.1)})
+    # The root is finite at zero, its slope is not.
+    (good.sum() + bad.sqrt()[0]).backward()
+    finite = {name: bool(torch.isfinite(sum_)) for name, sum_ in adam.gradients().items()}
+    assert finite == {"gradient of good": True, "gradient of bad": False}
