@@ -57,7 +57,7 @@ class Selection:
         wishes += [("--force", name) for name in sorted(self.force)]
         for option, name in [*wishes, *(("--skip", name) for name in sorted(self.skip))]:
             if name not in names:
-                raise InputError(f"{option} {name}: no such stage; choose of {', '.join(names)}")
+                raise InputError(f"{option} {name}: no such stage; choose from {', '.join(names)}")
         for name in sorted(self.skip - set(pipeline.skippable)):
             can = ", ".join(pipeline.skippable)
             raise InputError(f"--skip {name}: later stages need it; {can} can be left out")
