@@ -135,7 +135,7 @@ def test_selections_choose_their_part(store, source):
 @pytest.mark.parametrize(
     ("wishes", "complaint"),
     [
-        ({"until": "bake"}, "--until bake: no such stage; choose of digits, walk, total"),
+        ({"until": "bake"}, "--until bake: no such stage; choose from digits, walk, total"),
         ({"skip": {"digits"}}, "--skip digits: later stages need it; walk can be left out"),
         ({"skip": {"walk"}, "force": {"walk"}}, "--force walk: the stage is skipped"),
         ({"only": "walk", "until": "walk"}, "drop --from and --until"),
