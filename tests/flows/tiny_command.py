@@ -1,6 +1,7 @@
 """The `svim3d` command over the tiny pipeline, in this process or as one of its own."""
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -37,6 +38,8 @@ def start(arguments: Sequence[object]) -> subprocess.Popen[str]:
 
 
 if __name__ == "__main__":
+    # A shell starts background jobs with interrupts ignored, and children inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     code = main(sys.argv[1:])
     loaded = sorted({"torch", "prefect"} & set(sys.modules))
     print(f"loaded: {' '.join(loaded) or 'nothing'}")
