@@ -37,6 +37,7 @@ class MaterialViews:
         metallic: straight.
         normal_world: unit shading normals, straight.
         reference: index of the view at azimuth 0 that the asset was asked for by.
+        depth: distance along the camera's -z axis, zero where nothing is; None where nobody knows.
     """
 
     cameras: Cameras
@@ -47,6 +48,7 @@ class MaterialViews:
     metallic: Float[Tensor, "V H W 1"]
     normal_world: Float[Tensor, "V H W 3"]
     reference: int
+    depth: Float[Tensor, "V H W 1"] | None = None
 
     def premultiplied(self, longest_px: int) -> tuple[Cameras, dict[str, Tensor]]:
         """What an optimisation compares renders with: images times coverage, cameras to match.
@@ -81,6 +83,7 @@ class MaterialViews:
                 "roughness": self.roughness,
                 "metallic": self.metallic,
                 "normal_world": self.normal_world,
+                **({} if self.depth is None else {"depth": self.depth}),
             },
             reference=self.reference,
         )

@@ -2,14 +2,14 @@
 
 `orbit.json` holds `camera` {width, height, fov_deg (vertical)}, the frames and the reference;
 each frame names a multi-channel half-float EXR. Radiance (`R G B`) is premultiplied by the
-coverage `A`; basecolor, roughness, metallic and the world normal are straight. Two layouts are
-read: `frames` with `reference` as an index (what `write_orbit` makes), and the layout of
-benchmark sets: `train`, and `test` whose frames name one file per environment.
+coverage `A`; basecolor, roughness, metallic and the world normal are straight. Depth may be there
+or not. Two layouts are read: `frames` with `reference` as an index (what `write_orbit` makes), and
+the layout of benchmark sets: `train`, and `test` whose frames name one file per environment.
 """
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ CHANNELS = {
     "metallic": ("metallic.V",),
     "normal_world": ("normal.X", "normal.Y", "normal.Z"),
 }
+DEPTH = ("depth.Z",)  # along the camera's -z axis; image `depth`, where all views have it
 INDEX = "orbit.json"
 RIGID_TOLERANCE = 1e-3  # poses written with 4 decimals pass, mirrored or scaled ones do not
 
@@ -44,16 +45,17 @@ def write_orbit(
     Args:
         folder: where to.
         cameras: V poses.
-        images: the six named images of `CHANNELS`, each [V, H, W, C].
+        images: the named images of `CHANNELS`, each [V, H, W, C], and `depth` where it is known.
         reference: index of the view that the asset was asked for by.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    named = CHANNELS | ({"depth": DEPTH} if "depth" in images else {})
     frames = []
     for view in range(len(cameras)):
         name = f"{view:03d}.exr"
         planes = {
             channel: images[image][view, ..., i].detach().cpu().numpy()
-            for image, channels in CHANNELS.items()
+            for image, channels in named.items()
             for i, channel in enumerate(channels)
         }
         write_exr(folder / name, planes)
@@ -80,13 +82,18 @@ def _angles(cameras: Cameras, view: int) -> dict[str, float]:
 
 
 def read_orbit(
-    folder: Path, split: str = "train", *, notify: Notify | None = None
+    folder: Path,
+    split: str = "train",
+    *,
+    wanted: Collection[str] = tuple(CHANNELS),
+    notify: Notify | None = None,
 ) -> tuple[Cameras, Images, int]:
-    """Read cameras, the six images of `CHANNELS` as float32, and the reference index.
+    """Read cameras, images as float32, and the reference index.
 
     Args:
         folder: an orbit folder of either layout.
         split: `train`, or `test_A` for the test views under environment A.
+        wanted: which images of `CHANNELS` are needed; `depth` comes with them if all views have it.
         notify: told (kind, message) of every value that had to be mended; see `repair_images`.
 
     Raises:
@@ -96,10 +103,45 @@ def read_orbit(
     index = _read_index(folder)
     frames = _frames(folder, index, split)
     cameras = _cameras(folder, index, frames)
-    views = [_read_view(folder / f["file"], cameras.height, cameras.width) for f in frames]
-    images = {name: torch.stack([view[name] for view in views]) for name in CHANNELS}
     names = [frame["file"] for frame in frames]
+    images = _read_views([folder / name for name in names], cameras, wanted)
     return cameras, repair_images(images, names, notify), _reference(index, len(frames), split)
+
+
+def read_frame(
+    file: Path, camera: Cameras, *, wanted: Collection[str], notify: Notify | None = None
+) -> tuple[Cameras, Images]:
+    """Read one view by itself, as `read_orbit` reads many.
+
+    Args:
+        file: a multi-channel EXR like those of an orbit folder; where `orbit.json` beside it lists
+            the file, its camera is read there.
+        camera: one pose for a file that no orbit lists; the size is the file's own.
+        wanted: which images of `CHANNELS` are needed.
+        notify: told (kind, message) of what was mended or assumed.
+    """
+    listed = _listed_camera(file)
+    if listed is None:
+        planes = read_exr(file)
+        height, width = next(iter(planes.values())).shape
+        listed = camera.resized(height, width)
+        if notify is not None:
+            notify("camera_assumed", f"{file.name} is in no {INDEX}: taken to be seen as told")
+    images = _read_views([file], listed, wanted)
+    return listed, repair_images(images, [file.name], notify)
+
+
+def _listed_camera(file: Path) -> Cameras | None:
+    """Camera of a file that the `orbit.json` in its folder, or in the one above, lists."""
+    for folder in (file.parent, file.parent.parent):
+        if not (folder / INDEX).is_file():
+            continue
+        index = _read_index(folder)
+        for frame in (f for key in ("frames", "train", "test") for f in index.get(key, [])):
+            for name in (frame.get("file"), *frame.get("files", {}).values()):
+                if name is not None and (folder / name).resolve() == file.resolve():
+                    return _cameras(folder, index, [{"file": name, "c2w": frame["c2w"]}])
+    return None
 
 
 def _read_index(folder: Path) -> dict[str, Any]:
@@ -185,17 +227,29 @@ def _is_rigid(pose: Float[Tensor, "4 4"]) -> bool:
     )
 
 
-def _read_view(file: Path, height: int, width: int) -> dict[str, Float[Tensor, "_ _ _"]]:
-    """The images of one view."""
+def _read_views(files: list[Path], cameras: Cameras, wanted: Collection[str]) -> Images:
+    """The wanted images of all views, and depth if each of them has it."""
+    views = [_read_view(file, cameras.height, cameras.width, wanted) for file in files]
+    names = [*wanted, *(["depth"] if all("depth" in view for view in views) else [])]
+    return {name: torch.stack([view[name] for view in views]) for name in names}
+
+
+def _read_view(
+    file: Path, height: int, width: int, wanted: Collection[str]
+) -> dict[str, Float[Tensor, "_ _ _"]]:
+    """The wanted images of one view, and depth if it is there."""
     planes = read_exr(file)
-    wanted = [channel for channels in CHANNELS.values() for channel in channels]
-    missing = [channel for channel in wanted if channel not in planes]
+    named = {name: CHANNELS[name] for name in wanted}
+    needed = [channel for channels in named.values() for channel in channels]
+    missing = [channel for channel in needed if channel not in planes]
     if missing:
         raise ValueError(
-            f"wanted the channels {', '.join(wanted)} in {file}, missing {', '.join(missing)}; "
+            f"wanted the channels {', '.join(needed)} in {file}, missing {', '.join(missing)}; "
             "export them, or render the orbit from a mesh"
         )
-    shapes = {planes[channel].shape for channel in wanted}
+    if DEPTH[0] in planes:
+        named["depth"] = DEPTH
+    shapes = {planes[channel].shape for channels in named.values() for channel in channels}
     if shapes != {(height, width)}:
         raise ValueError(
             f"wanted {width}x{height} pixels in {file} as {INDEX} says, got "
@@ -203,7 +257,7 @@ def _read_view(file: Path, height: int, width: int) -> dict[str, Float[Tensor, "
         )
     return {
         name: torch.from_numpy(np.stack([planes[channel] for channel in channels], -1))
-        for name, channels in CHANNELS.items()
+        for name, channels in named.items()
     }
 
 

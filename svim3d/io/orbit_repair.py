@@ -30,7 +30,8 @@ def repair_images(images: Images, names: Sequence[str], notify: Notify | None) -
     """Bring every value into its range; valid images pass through bit for bit.
 
     Few non-finite pixels take the nearest finite pixel's values, negative radiance becomes zero,
-    coverage and materials are clamped to [0, 1], normals of wrong length are rescaled.
+    coverage and materials are clamped to [0, 1], normals of wrong length are rescaled, depths that
+    are no distance become zero.
 
     Args:
         images: the images of an orbit, see `svim3d.io.orbit.CHANNELS`.
@@ -45,7 +46,9 @@ def repair_images(images: Images, names: Sequence[str], notify: Notify | None) -
     for view, name in enumerate(names):
         _fill_non_finite(images, view, name, notify)
     for name, image in images.items():
-        if name == "normal_world":
+        if name == "depth":
+            images[name] = _known_depth(image, names, notify)
+        elif name == "normal_world":
             images[name] = _unit_normals(image, images["mask"], names, notify)
         else:
             highest = float("inf") if name == "radiance" else 1.0
@@ -55,7 +58,9 @@ def repair_images(images: Images, names: Sequence[str], notify: Notify | None) -
 
 def _fill_non_finite(images: Images, view: int, name: str, notify: Notify) -> None:
     """Give pixels with any NaN or infinity the values of their nearest finite neighbour."""
-    bad = torch.stack([~torch.isfinite(i[view]).all(-1) for i in images.values()]).any(0)
+    # Renderers write infinity for the depth of the background.
+    needed = [image for key, image in images.items() if key != "depth"]
+    bad = torch.stack([~torch.isfinite(i[view]).all(-1) for i in needed]).any(0)
     count = int(bad.sum())
     if not count:
         return
@@ -91,6 +96,16 @@ def _clamped(
     for view in torch.nonzero(outside)[:, 0].tolist():
         notify("clamped", f"{names[view]}: {int(outside[view])} values of {what} out of range")
     return image.clamp(0.0, highest) if bool(outside.any()) else image
+
+
+def _known_depth(
+    depth: Float[Tensor, "V H W 1"], names: Sequence[str], notify: Notify
+) -> Float[Tensor, "V H W 1"]:
+    """Depth with zero, which means "nothing here", for all that lies behind or nowhere."""
+    behind = (depth < 0.0) | torch.isnan(depth)
+    for view in torch.nonzero(behind.flatten(1).any(1))[:, 0].tolist():
+        notify("depth_dropped", f"{names[view]}: {int(behind[view].sum())} depths mean nothing")
+    return torch.where(behind | torch.isinf(depth), 0.0, depth)
 
 
 def _unit_normals(
