@@ -76,6 +76,7 @@ LIGHT = (
     "flows.config",
     "flows.console",
     "flows.engine",
+    "flows.job",
     "flows.pipeline",
     "flows.plan",
     "flows.run_folder",

@@ -46,7 +46,7 @@ class Watcher:
 
 def execute(store: Store, source: Path, *overrides: str, **wishes) -> tuple[Watcher, dict]:
     from flows.image_to_asset import run_plan
-    from flows.tasks import Bench
+    from flows.steps import Bench
 
     watcher = Watcher()
     plan = plan_tiny(store, source, *overrides, **wishes)

@@ -1,0 +1,117 @@
+"""A plan carried out for a person: computed, laid out in a run folder, told about on a console."""
+
+import signal
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from rich.console import Console
+
+from flows.console import RunDisplay, result_table, stage_warnings_on
+from flows.engine import Engine
+from flows.plan import Plan, Verdict
+from flows.run_folder import write_run_folder
+from stages.store import Store, Stored
+
+DONE = 0
+
+Compute = Callable[[Plan, "Job"], tuple[dict[str, Stored], dict[str, Any]]]
+
+
+class Job:
+    """Where a plan is carried out, and who is told.
+
+    Attributes:
+        store: where artifacts are kept.
+        out: the run folder.
+        device: "auto", "cpu" or "cuda".
+        console: where progress and results are told.
+    """
+
+    def __init__(self, store: Path, out: Path, device: str, console: Console) -> None:
+        self._start = time.monotonic()
+        self.out = out
+        self.device = device
+        self.console = console
+        self.store = Store(
+            store,
+            say=lambda text: console.print(text, style="yellow", highlight=False, markup=False),
+        )
+
+    def carry_out(self, plan: Plan, about: Mapping[str, Any], *, compute: Compute) -> int:
+        """Compute what is missing, write the run folder, print the table of all stages.
+
+        Args:
+            plan: what to do.
+            about: what the caller adds to `run.json`.
+            compute: what runs the steps; returns the artifacts and what it adds to `run.json`.
+        """
+        # A stop by the system must leave the same resumable state as Ctrl-C.
+        signal.signal(signal.SIGTERM, _interrupt)
+        if plan.to_compute:
+            artifacts, told = compute(plan, self)
+        else:
+            artifacts = {step.node.name: step.stored for step in plan.steps if step.stored}
+            told = {}
+        computed_s = sum(
+            stored.manifest.record["seconds"]
+            for stored in artifacts.values()
+            if not stored.is_cached
+        )
+        total_s = time.monotonic() - self._start
+        seconds = {"stages_s": round(computed_s, 2), "total_s": round(total_s, 2)}
+        page = {**about, "device": self.device, **told, **seconds}
+        write_run_folder(self.out, plan, artifacts, self.store, page)
+        self.console.print(result_table(plan, artifacts))
+        waited_s = told.get("engine_startup_s")
+        engine = f", {waited_s:.1f} s waiting for the engine" if waited_s is not None else ""
+        self.console.print(
+            f"{self.out}: {total_s:.1f} s in all, {computed_s:.1f} s in stages{engine}",
+            highlight=False,
+        )
+        return DONE
+
+
+def compute_under_engine(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[str, Any]]:
+    """Run the plan under Prefect; tells the seconds spent on the engine's start."""
+    forced = [s.node.name for s in plan.to_compute if s.stored is not None]
+    kept = [s.node.name for s in plan.steps if s.verdict is Verdict.CACHED]
+    if forced and kept:
+        job.console.print(
+            f"computing {', '.join(forced)} again; keys name recipes, so later stages that nothing "
+            f"else changed keep their artifacts (--from {forced[0]} recomputes them too)",
+            highlight=False,
+        )
+    with Engine(job.store.root / "prefect") as engine:
+        # All of this takes seconds to import, and does so while the server starts.
+        from flows.image_to_asset import run_plan
+        from flows.steps import Bench
+        from stages.execution import choose_device
+
+        device = choose_device(job.device)
+        for step in plan.to_compute:
+            step.node.load()
+        engine.wait()
+        with stage_warnings_on(job.console), RunDisplay(job.console) as display:
+            artifacts = run_plan(Bench(plan, job.store, device, display))
+        return artifacts, {"engine_startup_s": round(engine.waited_s, 2)}
+
+
+def compute_here(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[str, Any]]:
+    """Run the plan's steps one after the other in this process, without an engine."""
+    from flows.steps import Bench, obtain_step
+    from stages.execution import choose_device
+
+    artifacts: dict[str, Stored] = {}
+    with stage_warnings_on(job.console), RunDisplay(job.console) as display:
+        bench = Bench(plan, job.store, choose_device(job.device), display)
+        for step in plan.steps:
+            if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):
+                artifacts[step.node.name] = obtain_step(step, artifacts, bench)
+    return artifacts, {}
+
+
+def _interrupt(signal_number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

@@ -1,0 +1,78 @@
+"""One step of a plan, computed or found; whoever runs it, an engine or a command."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+
+from flows.pipeline import SOURCE
+from flows.plan import Plan, Step, Verdict
+from stages.base import Progress
+from stages.execution import run_stage
+from stages.store import Store, Stored
+
+
+class Observer(Protocol):
+    """Who watches a run."""
+
+    def started(self, step: Step) -> None:
+        """A stage begins to compute."""
+
+    def progressed(self, progress: Progress) -> None:
+        """A stage has done some of its steps."""
+
+    def failed(self, step: Step, error: BaseException) -> None:
+        """A stage failed; it may be tried again."""
+
+    def finished(self, step: Step, stored: Stored) -> None:
+        """A stage's artifact is in the store."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Where and how the stages of a plan are run.
+
+    Attributes:
+        plan: what to do.
+        store: where artifacts are.
+        device: where to compute.
+        observer: who watches.
+    """
+
+    plan: Plan
+    store: Store
+    device: torch.device
+    observer: Observer
+
+
+def obtain_step(step: Step, upstream: Mapping[str, Stored], bench: Bench) -> Stored:
+    """The artifact of a step, from the store or from its stage."""
+    stored = step.stored
+    if step.verdict is not Verdict.CACHED or stored is None:
+        stored = _compute(step, upstream, bench)
+    bench.observer.finished(step, stored)
+    return stored
+
+
+def _compute(step: Step, upstream: Mapping[str, Stored], bench: Bench) -> Stored:
+    if step.recipe is None:
+        raise ValueError(f"{step.node.name} is skipped and has nothing to run")
+    bench.observer.started(step)
+    try:
+        return run_stage(
+            bench.store,
+            step.recipe,
+            step.node.load(),
+            {
+                name: bench.plan.source if name == SOURCE else upstream.get(name)
+                for name in step.node.inputs
+            },
+            config=getattr(bench.plan.config, step.node.name),
+            device=bench.device,
+            force=step.stored is not None,
+            on_progress=bench.observer.progressed,
+        )
+    except Exception as error:
+        bench.observer.failed(step, error)
+        raise
