@@ -1,15 +1,13 @@
 """Settings of the generation stage."""
 
-import hashlib
 from pathlib import Path
-from typing import Any
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from stages.settings.base import StageConfig
+from stages.settings.base import FileReadingConfig
 
 
-class GenerationConfig(StageConfig):
+class GenerationConfig(FileReadingConfig):
     """How a mesh or a scene is turned into views; an orbit folder is taken as it is."""
 
     views: int = Field(default=21, ge=3, le=200)
@@ -36,20 +34,8 @@ class GenerationConfig(StageConfig):
     environment: Path | None = None
     """Lat-long light (.exr, linear); None is the built-in studio."""
 
-    environment_sha256: str | None = None
-    """Digest of that file, filled in by itself, so that another light makes another artifact."""
-
     environment_size: int = Field(default=128, ge=16, le=1024)
     """Side of the octahedral light map, pixels, a power of two."""
 
     supersample: int = Field(default=3, ge=1, le=8)
     """Samples per pixel and axis."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _digest_environment(cls, given: Any) -> Any:
-        """Read the light's digest whenever the settings are made."""
-        file = given.get("environment") if isinstance(given, dict) else None
-        if file is None or not Path(file).is_file():
-            return given
-        return given | {"environment_sha256": hashlib.sha256(Path(file).read_bytes()).hexdigest()}

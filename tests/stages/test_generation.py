@@ -332,9 +332,9 @@ def test_another_light_file_makes_other_settings(tmp_path):
     first = GenerationConfig(environment=file)
     write_rgb(file, np.full((8, 16, 3), 2.0, np.float32))
     second = GenerationConfig(environment=file)
-    assert first.environment_sha256 != second.environment_sha256
+    assert first.digests != second.digests
     assert GenerationConfig(**second.model_dump()) == second
-    assert GenerationConfig().environment_sha256 is None
+    assert not GenerationConfig().digests
 
 
 def test_light_with_impossible_texels_is_mended_and_told(tmp_path, ctx):
