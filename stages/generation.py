@@ -5,8 +5,6 @@ Reads an orbit folder (path-traced, photographed or generated elsewhere), or a m
 Rendered radiance is a split-sum approximation without visibility: no shadows, no interreflection.
 """
 
-import math
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -17,13 +15,13 @@ from stages.artifacts import MaterialViews
 from stages.base import Context, Stage
 from stages.errors import InputError
 from stages.settings.generation import GenerationConfig
-from svim3d.cameras import orbit_angles, orbit_cameras
+from svim3d.cameras import fitting_radius, orbit_angles, orbit_cameras
 from svim3d.io.exr import read_rgb
 from svim3d.io.glb import read_mesh
 from svim3d.io.orbit import read_orbit
 from svim3d.io.orbit_repair import admit_views
 from svim3d.io.scene import read_scene
-from svim3d.mesh.source_mesh import SourceMesh
+from svim3d.mesh.source_mesh import SourceMesh, normalised
 from svim3d.render.deferred import environment_shader
 from svim3d.render.pictures import render_pictures
 from svim3d.shading.environment import octahedral_from_latlong, physical_radiance
@@ -32,7 +30,6 @@ from svim3d.shading.prefilter import PyramidOperator
 from svim3d.shading.studio import studio_radiance
 
 SCENE_SUFFIX = ".json"
-MIN_EXTENT = 1e-9  # a mesh below this, in its own unit, is a point
 
 
 def run(source: Path, *, config: GenerationConfig, ctx: Context) -> MaterialViews:
@@ -50,7 +47,7 @@ def run(source: Path, *, config: GenerationConfig, ctx: Context) -> MaterialView
         if source.is_dir():
             return _from_orbit(source, ctx)
         mesh = read_scene(source) if source.suffix.lower() == SCENE_SUFFIX else read_mesh(source)
-        return _from_mesh(_normalised(mesh, source), config, ctx)
+        return _from_mesh(normalised(mesh, source.name), config, ctx)
     except InputError:
         raise
     except ValueError as error:
@@ -64,19 +61,9 @@ def _from_orbit(folder: Path, ctx: Context) -> MaterialViews:
     return MaterialViews(cameras=cameras, reference=reference, **images)
 
 
-def _normalised(mesh: SourceMesh, source: Path) -> SourceMesh:
-    """The same mesh, centred, with its bounding box's longest side 1."""
-    used = mesh.vertices[torch.unique(mesh.faces.long())]
-    low, high = used.amin(0), used.amax(0)
-    extent = float((high - low).max())
-    if not extent > MIN_EXTENT:
-        raise InputError(f"wanted a mesh with an extent, but all of {source} lies in one point")
-    return replace(mesh, vertices=(mesh.vertices - (low + high) / 2) / extent)
-
-
 def _from_mesh(mesh: SourceMesh, config: GenerationConfig, ctx: Context) -> MaterialViews:
     """Render the orbit, one view at a time."""
-    radius = config.radius if config.radius is not None else _fitting_radius(mesh, config)
+    radius = config.radius or fitting_radius(mesh.vertices, config.fov_y_deg, config.fill)
     angles = orbit_angles(config.views, config.elevation_mean_deg, config.elevation_swing_deg)
     cameras = orbit_cameras(angles, radius=radius, fov_y_deg=config.fov_y_deg, size=config.size)
     light = _environment(config, ctx)
@@ -91,13 +78,6 @@ def _from_mesh(mesh: SourceMesh, config: GenerationConfig, ctx: Context) -> Mate
     images = {name: image.half().float() for name, image in images.items()}
     cameras, images, reference = admit_views(cameras, images, len(cameras) - 1, ctx.event)
     return MaterialViews(cameras=cameras, reference=reference, **images)
-
-
-def _fitting_radius(mesh: SourceMesh, config: GenerationConfig) -> float:
-    """Distance at which the bounding sphere takes `fill` of the image's height."""
-    bound = float(torch.linalg.vector_norm(mesh.vertices, dim=1).max())
-    half_angle = math.atan(config.fill * math.tan(math.radians(config.fov_y_deg) / 2))
-    return bound / math.sin(half_angle)
 
 
 def _environment(config: GenerationConfig, ctx: Context) -> Float[Tensor, "N N 3"]:

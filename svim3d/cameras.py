@@ -134,3 +134,10 @@ def orbit_cameras(
     """Square cameras at (elevation, azimuth) pairs in degrees, all looking at the origin."""
     poses = torch.stack([look_at_origin(e, a, radius) for e, a in angles])
     return Cameras(c2w=poses, fov_y_deg=fov_y_deg, height=size, width=size)
+
+
+def fitting_radius(vertices: Float[Tensor, "N 3"], fov_y_deg: float, fill: float) -> float:
+    """Distance at which the bounding sphere about the origin takes `fill` of the image's height."""
+    bound = float(torch.linalg.vector_norm(vertices, dim=1).max())
+    half_angle = math.atan(fill * math.tan(math.radians(fov_y_deg) / 2))
+    return bound / math.sin(half_angle)

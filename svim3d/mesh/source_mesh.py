@@ -1,7 +1,7 @@
 """A mesh as an artist made it: one triangle soup with several metallic-roughness materials."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -9,6 +9,8 @@ from torch import Tensor
 
 from svim3d.mesh.frames import tangent_frames
 from svim3d.mesh.mesh import vertex_normals
+
+MIN_EXTENT = 1e-9  # a mesh below this, in its own unit, is a point
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,20 @@ class SourceMesh:
     colors: Float[Tensor, "N 3"]
     face_material: Int[Tensor, "F"]
     materials: tuple[SourceMaterial, ...]
+
+
+def normalised(mesh: SourceMesh, name: str) -> SourceMesh:
+    """The same mesh, centred, with its bounding box's longest side 1; `name` is for the message.
+
+    Raises:
+        ValueError: the mesh has no extent.
+    """
+    used = mesh.vertices[torch.unique(mesh.faces.long())]
+    low, high = used.amin(0), used.amax(0)
+    extent = float((high - low).max())
+    if not extent > MIN_EXTENT:
+        raise ValueError(f"wanted a mesh with an extent, but all of {name} lies in one point")
+    return replace(mesh, vertices=(mesh.vertices - (low + high) / 2) / extent)
 
 
 def merge(parts: Sequence[SourceMesh]) -> SourceMesh:
