@@ -17,6 +17,7 @@ from stages.settings.export import ExportConfig
 from stages.settings.generation import GenerationConfig
 from stages.settings.nerf import NerfConfig
 from stages.settings.preview import PreviewConfig
+from stages.settings.relight import RelightConfig
 from stages.settings.uv_bake import UvBakeConfig
 
 PRESETS = ("preview", "standard", "paper")  # from quick to thorough
@@ -42,6 +43,12 @@ class PipelineConfig(RunConfig):
     uv_bake: UvBakeConfig = UvBakeConfig()
     export: ExportConfig = ExportConfig()
     preview: PreviewConfig = PreviewConfig()
+
+
+class RelightRunConfig(RunConfig):
+    """Settings of relighting."""
+
+    relight: RelightConfig = RelightConfig()
 
 
 ConfigT = TypeVar("ConfigT", bound=RunConfig)
@@ -70,6 +77,15 @@ def load_config(
     if not isinstance(left_out, list):
         raise InputError(f"--set skip={left_out}: wanted a list of stages, like skip=[dmtet]")
     values["skip"] = [*left_out, *skip]
+    return validated(schema, values)
+
+
+def validated(schema: type[ConfigT], values: Mapping[str, Any]) -> ConfigT:
+    """Settings made of nested names and values.
+
+    Raises:
+        InputError: an unknown name (with the nearest valid ones) or a value out of bounds.
+    """
     try:
         return schema.model_validate(values)
     except ValidationError as error:

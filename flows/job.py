@@ -12,7 +12,7 @@ from rich.console import Console
 from flows.console import RunDisplay, result_table, stage_warnings_on
 from flows.engine import Engine
 from flows.plan import Plan, Verdict
-from flows.run_folder import write_run_folder
+from flows.run_folder import require_ours, write_run_folder
 from stages.store import Store, Stored
 
 DONE = 0
@@ -48,6 +48,7 @@ class Job:
             about: what the caller adds to `run.json`.
             compute: what runs the steps; returns the artifacts and what it adds to `run.json`.
         """
+        require_ours(self.out, plan.pipeline)
         # A stop by the system must leave the same resumable state as Ctrl-C.
         signal.signal(signal.SIGTERM, _interrupt)
         if plan.to_compute:

@@ -42,7 +42,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Product:
-    """A file that the user came for.
+    """A file, or a folder of files, that the user came for.
 
     Attributes:
         name: in the run folder.
@@ -89,5 +89,22 @@ IMAGE_TO_ASSET = Pipeline(
             "environment.exr", (("export", "environment.exr"), ("env_preopt", "environment.exr"))
         ),
         Product("preview.png", (("preview", "preview.png"),)),
+    ),
+)
+
+RELIGHT = Pipeline(
+    name="relight",
+    nodes=(Node("relight", (SOURCE,)),),
+    products=tuple(
+        Product(name, (("relight", name),))
+        for name in (
+            "views",
+            "contact_sheet.png",
+            "turntable.gif",
+            "turntable.mp4",
+            "turntable",
+            "edits.json",
+            "mask.png",
+        )
     ),
 )

@@ -4,11 +4,11 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flows.pipeline import Product
+from flows.pipeline import Pipeline, Product
 from flows.plan import Plan, state_of
 from stages.errors import InputError
 from stages.store import Store, Stored
@@ -36,10 +36,14 @@ def write_run_folder(
         about: what the caller adds to `run.json`: preset, device, engine start-up, ...
 
     Raises:
-        InputError: if the folder cannot be written.
+        InputError: if the folder cannot be written, or holds what no run has put there.
     """
+    require_ours(out, plan.pipeline)
     try:
         out.mkdir(parents=True, exist_ok=True)
+        # First of all the mark of a run folder, in case this is killed half-way.
+        if not (out / RUN_PAGE).exists():
+            _replace(out / RUN_PAGE, b"{}")
         for node in plan.pipeline.nodes:
             stored = artifacts.get(node.name)
             _link(out / node.name, store.artifact(stored.key) if stored else None)
@@ -49,6 +53,21 @@ def write_run_folder(
         _replace(out / RUN_PAGE, page.encode())
     except OSError as error:
         raise InputError(f"the run folder {out} cannot be written: {error}") from error
+
+
+def require_ours(out: Path, pipeline: Pipeline) -> None:
+    """Refuse a folder in which somebody else's files would be replaced.
+
+    Raises:
+        InputError: naming them.
+    """
+    names = [*pipeline.names, *(product.name for product in pipeline.products)]
+    others = [name for name in names if os.path.lexists(out / name)]
+    if others and not (out / RUN_PAGE).exists():
+        raise InputError(
+            f"the folder {out} is no run folder, yet holds {', '.join(others)}, which this run "
+            "would replace; choose another folder with -o"
+        )
 
 
 def _link(link: Path, target: Path | None) -> None:
@@ -66,11 +85,20 @@ def _link(link: Path, target: Path | None) -> None:
 
 
 def _copy_product(out: Path, product: Product, artifacts: Mapping[str, Stored]) -> None:
+    """Copy a file, or a folder of files; what an earlier run left under its name goes."""
+    target = out / product.name
     for stage, name in product.origins:
-        if stage in artifacts and (file := artifacts[stage].folder / name).is_file():
-            _replace(out / product.name, file.read_bytes())
-            return
-    (out / product.name).unlink(missing_ok=True)
+        source = artifacts[stage].folder / name if stage in artifacts else None
+        if source is not None and source.is_file():
+            return _replace(target, source.read_bytes())
+        if source is not None and source.is_dir():
+            shutil.rmtree(target, ignore_errors=True)
+            shutil.copytree(source, target)
+            return None
+    if target.is_dir():
+        shutil.rmtree(target)
+    target.unlink(missing_ok=True)
+    return None
 
 
 def _replace(file: Path, content: bytes) -> None:

@@ -311,12 +311,12 @@ class TexturedMesh:
 
 
 @dataclass(frozen=True)
-class ExportedAsset:
-    """The finished files: always `asset.glb`, other formats on request.
+class FinishedFiles:
+    """Files as their user gets them.
 
     Attributes:
         files: relative name -> content.
-        summary: counts and checks made on the reopened file, for the run's table.
+        summary: counts and checks, for the run's table.
     """
 
     files: dict[str, bytes]
@@ -341,6 +341,24 @@ class ExportedAsset:
             summary=json.loads((folder / "summary.json").read_text()),
         )
 
+
+class ExportedAsset(FinishedFiles):
+    """The asset: always `asset.glb`, other formats on request; checked on the reopened file."""
+
     def headline(self) -> str:
         """Size of the GLB."""
         return f"asset.glb of {len(self.files['asset.glb']) / 2**20:.2f} MiB"
+
+
+class RelitViews(FinishedFiles):
+    """Views under another light.
+
+    `views/` holds per view a multi-layer EXR (scene-linear) and a PNG (as displayed); beside it lie
+    the contact sheet, the turntable and, where materials were changed, the record of the edits.
+    """
+
+    def headline(self) -> str:
+        """How many pictures, of what size."""
+        about = self.summary
+        turns = f", {about['frames']} turns of the light" if about["frames"] != 1 else ""
+        return f"{about['views']} views of {about['width']} x {about['height']}{turns}"

@@ -61,3 +61,13 @@ def test_forbidden_folder_is_refused(store, source, tmp_path):
     (tmp_path / "out").write_text("a file is in the way")
     with pytest.raises(InputError, match=r"run folder .* cannot be written"):
         write_run_folder(tmp_path / "out", plan, compute(plan, store), store, {})
+
+
+def test_folder_of_somebody_else_is_left_alone(store, source, tmp_path):
+    plan = plan_tiny(store, source)
+    (tmp_path / "out" / "walk").mkdir(parents=True)
+    (tmp_path / "out" / "walk" / "diary.txt").write_text("mine")
+    with pytest.raises(InputError, match="is no run folder, yet holds walk"):
+        write_run_folder(tmp_path / "out", plan, compute(plan, store), store, {})
+    assert (tmp_path / "out" / "walk" / "diary.txt").read_text() == "mine"
+    assert not (tmp_path / "out" / "run.json").exists()
