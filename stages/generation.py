@@ -74,8 +74,8 @@ def _from_mesh(mesh: SourceMesh, config: GenerationConfig, ctx: Context) -> Mate
         views.append(pictures)
         ctx.report(view + 1, len(cameras), {"coverage": float(pictures["mask"].mean())})
     images = {name: torch.cat([pictures[name] for pictures in views]) for name in views[0]}
-    # What a reload would read: the folder stores half floats.
-    images = {name: image.half().float() for name, image in images.items()}
+    # What a reload would read: the folder stores half floats, but for depth.
+    images = {n: i if n == "depth" else i.half().float() for n, i in images.items()}
     cameras, images, reference = admit_views(cameras, images, len(cameras) - 1, ctx.event)
     return MaterialViews(cameras=cameras, reference=reference, **images)
 

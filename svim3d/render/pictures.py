@@ -21,7 +21,9 @@ from svim3d.render.deferred import (
     normal_from_tangent,
     render_mesh,
 )
+from svim3d.render.gbuffer import GBuffer
 
+BUFFERS = ("basecolor", "roughness", "metallic", "normal_world", "depth")
 ATTRIBUTES = {"uv": 2, "tangent": 4, "color": 3}
 
 
@@ -38,8 +40,27 @@ def render_pictures(
 
     Returns:
         `radiance` (linear, premultiplied), `mask`, and straight `basecolor`, `roughness`,
-        `metallic`, `normal_world`: the six images of an orbit.
+        `metallic`, `normal_world` and `depth`: the images of an orbit.
     """
+    return _images(mesh, cameras, shader, supersample, ("radiance", "mask", *BUFFERS))
+
+
+def render_gbuffer(mesh: SourceMesh, cameras: Cameras) -> GBuffer:
+    """Materials, normals and depth at the centre of every pixel; both sides of a face are seen.
+
+    For smooth pictures, ask for larger ones and average what is shaded from them.
+    """
+    return GBuffer.of(cameras, _images(mesh, cameras, None, 1, ("mask", *BUFFERS)))
+
+
+def _images(
+    mesh: SourceMesh,
+    cameras: Cameras,
+    shader: Shader | None,
+    supersample: int,
+    names: tuple[str, ...],
+) -> dict[str, Float[Tensor, "_ _ _ _"]]:
+    """The named images of all views."""
     geometry = Geometry(
         vertices=mesh.vertices,
         faces=mesh.faces,
@@ -54,7 +75,6 @@ def render_pictures(
         ).straight()
         for view in range(len(cameras))
     ]
-    names = ("radiance", "mask", "basecolor", "roughness", "metallic", "normal_world")
     return {name: torch.stack([getattr(view, name) for view in views]) for name in names}
 
 

@@ -5,7 +5,7 @@ from svim3d.cameras import orbit_cameras
 from svim3d.mesh.source_mesh import SourceMaterial, SourceMesh
 from svim3d.numerics import normalize
 from svim3d.render.deferred import environment_shader
-from svim3d.render.pictures import render_pictures
+from svim3d.render.pictures import render_gbuffer, render_pictures
 from svim3d.shading.prefilter import PyramidOperator
 
 
@@ -117,3 +117,20 @@ def test_a_mirror_shows_the_light_in_its_place():
     mirror = SourceMaterial(roughness_factor=0.0, metallic_factor=1.0)
     pictures = render_pictures(square([mirror]), front(), shader, supersample=1)
     assert pictures["radiance"][0, 32, 32].tolist() == pytest.approx([0.0, 2.0, 0.0], abs=2e-3)
+
+
+def test_buffers_hold_what_the_picture_was_shaded_from():
+    basecolor = torch.rand(4, 4, 3, generator=torch.Generator().manual_seed(1))
+    mesh = square([SourceMaterial(basecolor=basecolor, roughness_factor=0.4, metallic_factor=0.2)])
+    camera = front()
+
+    def shader(normal, wo, material):
+        return material.basecolor * normal[..., 2:] + wo * material.roughness + material.metallic
+
+    picture = render_pictures(mesh, camera, shader, supersample=1)
+    gbuffer = render_gbuffer(mesh, camera)
+    shaded = shader(gbuffer.normal_world[0], gbuffer.view_directions(0), gbuffer.take([0]))
+    torch.testing.assert_close((shaded * gbuffer.mask)[0], picture["radiance"][0])
+    covered = gbuffer.mask[0, ..., 0] > 0
+    # The square lies in the plane z = 0.
+    assert float(gbuffer.positions(0)[covered][:, 2].abs().max()) < 1e-5
