@@ -34,7 +34,7 @@ class GenerationConfig(StageConfig):
     """Share of the image's height that the object's bounding sphere takes when radius is None."""
 
     environment: Path | None = None
-    """Lat-long light (.exr, linear); None is the built-in studio."""
+    """Light (.exr, .hdr, .png, ...), lat-long, octahedral or cube; None is the built-in studio."""
 
     environment_sha256: str | None = None
     """Digest of that file, filled in by itself, so that another light makes another artifact."""

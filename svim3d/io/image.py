@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont, UnidentifiedImageError
 from torch import Tensor
 
 from svim3d.color import linear_from_srgb, srgb_from_linear
+from svim3d.io.limits import check_size
 
 MODES = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}
 CHANNELS_WITH_OPACITY = (2, 4)  # their last channel is never gamma encoded
@@ -32,8 +33,9 @@ def decode_image(content: bytes, *, srgb: bool = False) -> Float[Tensor, "H W C"
     """
     try:
         with Image.open(io.BytesIO(content)) as picture:
+            check_size(picture.height, picture.width)
             values = _plain_array(picture)
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+    except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise ValueError(f"wanted a PNG or JPEG picture, cannot decode it: {error}") from error
     image = torch.from_numpy(values)
     return _on_colour(image, linear_from_srgb) if srgb else image
@@ -41,6 +43,8 @@ def decode_image(content: bytes, *, srgb: bool = False) -> Float[Tensor, "H W C"
 
 def _plain_array(picture: Image.Image) -> NDArray[np.float32]:
     """Pixels of any mode as float32 [H, W, C] in [0, 1]."""
+    if picture.mode == "F":
+        raise ValueError("floating-point pictures are read as .exr only; convert it")
     if picture.mode.startswith("I"):
         return np.asarray(picture, np.float32)[..., None] / np.float32(MAX_16BIT)
     if picture.mode not in MODES.values():
