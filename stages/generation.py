@@ -16,15 +16,14 @@ from stages.base import Context, Stage
 from stages.errors import InputError
 from stages.settings.generation import GenerationConfig
 from svim3d.cameras import fitting_radius, orbit_angles, orbit_cameras
-from svim3d.io.exr import read_rgb
 from svim3d.io.glb import read_mesh
+from svim3d.io.light import read_light
 from svim3d.io.orbit import read_orbit
 from svim3d.io.orbit_repair import admit_views
 from svim3d.io.scene import read_scene
 from svim3d.mesh.source_mesh import SourceMesh, normalised
 from svim3d.render.deferred import environment_shader
 from svim3d.render.pictures import render_pictures
-from svim3d.shading.environment import octahedral_from_latlong, physical_radiance
 from svim3d.shading.octahedral import texel_directions
 from svim3d.shading.prefilter import PyramidOperator
 from svim3d.shading.studio import studio_radiance
@@ -84,10 +83,8 @@ def _environment(config: GenerationConfig, ctx: Context) -> Float[Tensor, "N N 3
     """The light as an octahedral map."""
     if config.environment is None:
         return studio_radiance(texel_directions(config.environment_size))
-    latlong, mended = physical_radiance(torch.from_numpy(read_rgb(config.environment)))
-    if mended:
-        ctx.event("light_mended", f"{config.environment.name}: {mended} texels were no light")
-    return octahedral_from_latlong(latlong, config.environment_size)
+    light = read_light(config.environment, ctx.event)
+    return light.octahedral(config.environment_size)
 
 
 GENERATION = Stage(run)

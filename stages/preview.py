@@ -21,7 +21,7 @@ from stages.settings.preview import PreviewConfig
 from svim3d.color import srgb_from_linear
 from svim3d.io.exr import read_rgb
 from svim3d.io.glb import read_mesh
-from svim3d.io.image import Label, read_png, with_labels, write_png
+from svim3d.io.image import INK, PAPER, Label, read_png, with_labels, write_png
 from svim3d.metrics import mean_angle_deg, psnr
 from svim3d.render.deferred import environment_shader
 from svim3d.render.pictures import render_pictures
@@ -30,7 +30,6 @@ from svim3d.shading.prefilter import PyramidOperator
 from svim3d.shading.tonemap import agx
 
 LIGHT_FILE = "environment.exr"
-PAPER, INK = 0.11, 0.86  # display-encoded greys of the sheet's background and text
 MARGIN, LABEL_WIDTH, HEADER = 8, 104, 36  # pixels
 TEXT_PX, TITLE_PX = 13, 15
 AIR = 1.06  # pictures are cropped to the object and this much around it

@@ -58,6 +58,7 @@ DOORS = {
     "OpenEXR": ("svim3d.io.exr",),
     "safetensors": ("svim3d.io.weights",),
     "PIL": ("svim3d.io.image",),
+    "imageio_ffmpeg": ("svim3d.io.animation",),
     "trimesh": ("svim3d.io.glb", "svim3d.io.obj"),
     "xatlas": ("svim3d.mesh.xatlas_process",),
     "mitsuba": ("svim3d.render.path_tracing",),

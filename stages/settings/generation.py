@@ -32,7 +32,7 @@ class GenerationConfig(FileReadingConfig):
     """Share of the image's height that the object's bounding sphere takes when radius is None."""
 
     environment: Path | None = None
-    """Lat-long light (.exr, linear); None is the built-in studio."""
+    """Light (.exr, .hdr, .png, ...), lat-long, octahedral or cube; None is the built-in studio."""
 
     environment_size: int = Field(default=128, ge=16, le=1024)
     """Side of the octahedral light map, pixels, a power of two."""

@@ -1,13 +1,19 @@
 """The OpenEXR door: multi-channel scene-linear images."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
+from svim3d.io.limits import check_size
+
 Plane = NDArray[np.float32]
+
+MAX_HALF = 65504.0  # the largest finite 16-bit float
+BEAUTY = "beauty"  # the layer that viewers show first
+COLOUR_LAYERS = ("beauty", "combined", "rgba", "rgb")  # names that renderers give it, lower case
 
 
 def write_exr(file: Path, channels: Mapping[str, Plane], *, half: bool = True) -> None:
@@ -22,7 +28,7 @@ def write_exr(file: Path, channels: Mapping[str, Plane], *, half: bool = True) -
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     packed = {
         name: np.ascontiguousarray(
-            np.clip(plane, -65504.0, 65504.0) if half and name != "depth.Z" else plane,
+            np.clip(plane, -MAX_HALF, MAX_HALF) if half and name != "depth.Z" else plane,
             np.float16 if half and name != "depth.Z" else np.float32,
         )
         for name, plane in channels.items()
@@ -35,9 +41,14 @@ def read_exr(file: Path) -> dict[str, Plane]:
     """Read every channel as float32 planes [H, W].
 
     Raises:
-        ValueError: the file is missing, truncated or no EXR.
+        ValueError: the file is missing, truncated, too large or no EXR.
     """
     try:
+        # Without this look at the header, memory is set aside for whatever size it claims.
+        with OpenEXR.File(str(file), header_only=True) as image:
+            low, high = image.header()["dataWindow"]
+            width, height = (high.astype(np.int64) - low.astype(np.int64) + 1).tolist()
+        check_size(height, width)
         with OpenEXR.File(str(file), separate_channels=True) as image:
             return {
                 name: np.asarray(channel.pixels, np.float32)
@@ -53,9 +64,79 @@ def write_rgb(file: Path, rgb: NDArray[np.float32], *, half: bool = True) -> Non
 
 
 def read_rgb(file: Path) -> NDArray[np.float32]:
-    """Read channels R, G, B as an [H, W, 3] image."""
+    """Read channels R, G, B as an [H, W, 3] image; others are ignored."""
     channels = read_exr(file)
     missing = [name for name in "RGB" if name not in channels]
     if missing:
         raise ValueError(f"{file} has no channel {missing}, only {sorted(channels)}")
     return np.stack([channels[name] for name in "RGB"], -1)
+
+
+def read_colour(file: Path) -> NDArray[np.float32]:
+    """Read the colour of any EXR as an [H, W, 3] image: R, G, B, else a layer's, else grey Y.
+
+    Of several layers (`ViewLayer.Combined.R`, `diffuse.R`) the combined one is taken, else the
+    first by name. Other channels are ignored.
+
+    Raises:
+        ValueError: the file cannot be read or holds no colour; says what it holds.
+    """
+    channels = read_exr(file)
+    layers = [
+        name.removesuffix("R")
+        for name in channels
+        if (name == "R" or name.endswith(".R"))
+        and all(name.removesuffix("R") + c in channels for c in "GB")
+    ]
+    if layers:
+        layer = min(layers, key=_layer_rank)
+        return np.stack([channels[layer + name] for name in "RGB"], -1)
+    if "Y" in channels and "RY" not in channels:
+        return np.repeat(channels["Y"][..., None], 3, -1)
+    raise ValueError(
+        f"wanted channels R, G, B or Y in {file}, got {sorted(channels)}; convert it to RGB"
+    )
+
+
+def _layer_rank(prefix: str) -> tuple[bool, bool, str]:
+    """Sort key: no layer name at all, then names of the combined picture, then by name."""
+    last = prefix.rstrip(".").rpartition(".")[2].lower()
+    return prefix != "", last not in COLOUR_LAYERS, prefix
+
+
+def write_layers(
+    file: Path,
+    layers: Mapping[str, NDArray[np.float32]],
+    *,
+    notify: Callable[[str, str], None] | None = None,
+) -> None:
+    """Write colour layers as one single-part half-float EXR, as Blender, Nuke and DJV read it.
+
+    `beauty` becomes the channels R, G, B (and A), any other layer `name.R`, `name.G`, `name.B`
+    (and `name.A`), a layer of one channel `name.Y`.
+
+    Args:
+        file: where to; replaced if it exists.
+        layers: name -> linear [H, W, 1, 3 or 4], all of one size. EXR wants colour that is
+            already multiplied by coverage; values are written as given.
+        notify: told (kind, message) of values beyond half floats, which are clipped.
+
+    Raises:
+        ValueError: a layer has another size or number of channels.
+    """
+    channels: dict[str, Plane] = {}
+    clipped = 0
+    for name, picture in layers.items():
+        if picture.ndim != 3 or picture.shape[-1] not in (1, 3, 4):
+            raise ValueError(f"wanted layer {name} as [H, W, 1, 3 or 4], got {picture.shape}")
+        letters = "Y" if picture.shape[-1] == 1 else "RGBA"
+        prefix = "" if name == BEAUTY else f"{name}."
+        for i in range(picture.shape[-1]):
+            channels[prefix + letters[i]] = picture[..., i]
+        clipped += int((np.abs(picture) > MAX_HALF).any(-1).sum())
+    sizes = {plane.shape for plane in channels.values()}
+    if len(sizes) != 1:
+        raise ValueError(f"wanted layers of one size, got {sorted(sizes)}")
+    if clipped and notify is not None:
+        notify("clipped", f"{file.name}: {clipped} pixels above {MAX_HALF:.0f} were clipped")
+    write_exr(file, channels)

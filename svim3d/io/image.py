@@ -1,7 +1,7 @@
-"""The Pillow door: 8-bit pictures in and out, 16-bit grey in."""
+"""The Pillow door: 8-bit pictures in and out, 16-bit grey in, GIF and labelled sheets out."""
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +13,17 @@ from PIL import Image, ImageDraw, ImageFont, UnidentifiedImageError
 from torch import Tensor
 
 from svim3d.color import linear_from_srgb, srgb_from_linear
+from svim3d.io.limits import check_size
 
 MODES = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}
 CHANNELS_WITH_OPACITY = (2, 4)  # their last channel is never gamma encoded
 MAX_8BIT, MAX_16BIT = 255.0, 65535.0
+PALETTE_BITS = 5  # per channel, of the colour counts behind a palette
+PALETTE_SIZE = 256
+GIF_SHORTEST_MS = 20  # browsers slow down what asks for less
+PAPER, INK = 0.11, 0.86  # display-encoded greys of a sheet's background and text
+SHEET_MARGIN_PX, SHEET_TEXT_PX = 8, 14
+PALETTE_SAMPLES = 1 << 16  # pixels that stand for all of an animation
 COMPRESSION_LEVEL = 6  # fixed, so that equal pictures give equal bytes
 
 
@@ -32,8 +39,9 @@ def decode_image(content: bytes, *, srgb: bool = False) -> Float[Tensor, "H W C"
     """
     try:
         with Image.open(io.BytesIO(content)) as picture:
+            check_size(picture.height, picture.width)
             values = _plain_array(picture)
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+    except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise ValueError(f"wanted a PNG or JPEG picture, cannot decode it: {error}") from error
     image = torch.from_numpy(values)
     return _on_colour(image, linear_from_srgb) if srgb else image
@@ -41,6 +49,8 @@ def decode_image(content: bytes, *, srgb: bool = False) -> Float[Tensor, "H W C"
 
 def _plain_array(picture: Image.Image) -> NDArray[np.float32]:
     """Pixels of any mode as float32 [H, W, C] in [0, 1]."""
+    if picture.mode == "F":
+        raise ValueError("floating-point pictures are read as .exr only; convert it")
     if picture.mode.startswith("I"):
         return np.asarray(picture, np.float32)[..., None] / np.float32(MAX_16BIT)
     if picture.mode not in MODES.values():
@@ -120,3 +130,78 @@ def with_labels(
         font = ImageFont.load_default(label.size_px)
         draw.text((label.x, label.y), label.text, fill=grey, font=font, anchor="lm")
     return torch.from_numpy(_plain_array(picture))
+
+
+def contact_sheet(
+    pictures: Sequence[Float[Tensor, "_ _ 3"]], labels: Sequence[str], *, columns: int
+) -> Float[Tensor, "_ _ 3"]:
+    """Display-encoded pictures of any size side by side, a line of text above each.
+
+    Cells are as large as the largest picture; smaller ones are centred.
+    """
+    if not pictures or len(pictures) != len(labels):
+        raise ValueError(f"wanted a label for each picture, got {len(labels)}, {len(pictures)}")
+    columns = min(columns, len(pictures))
+    height = max(picture.shape[0] for picture in pictures)
+    width = max(picture.shape[1] for picture in pictures)
+    step_y, step_x = height + SHEET_TEXT_PX + 3 * SHEET_MARGIN_PX, width + SHEET_MARGIN_PX
+    rows = -(-len(pictures) // columns)
+    sheet = torch.full((rows * step_y, columns * step_x + SHEET_MARGIN_PX, 3), PAPER)
+    marks = []
+    for i, (picture, text) in enumerate(zip(pictures, labels, strict=True)):
+        x = SHEET_MARGIN_PX + i % columns * step_x
+        y = i // columns * step_y
+        marks.append(Label(x, y + SHEET_MARGIN_PX + SHEET_TEXT_PX // 2, text, SHEET_TEXT_PX))
+        top = y + SHEET_TEXT_PX + 2 * SHEET_MARGIN_PX + (height - picture.shape[0]) // 2
+        left = x + (width - picture.shape[1]) // 2
+        sheet[top : top + picture.shape[0], left : left + picture.shape[1]] = picture.cpu()
+    return with_labels(sheet, marks, ink=INK)
+
+
+def palette_of_histogram(counts: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """256 colours [256, 3] for pixels counted by their leading 5 bits, red first.
+
+    Source: Heckbert 1982, "Color image quantization for frame buffer display" (median cut).
+    """
+    total = max(1, int(counts.sum()))
+    # Rare colours, a small highlight, count as one pixel at least.
+    shares = np.where(counts > 0, np.maximum(1, counts * PALETTE_SAMPLES // total), 0)
+    index = np.repeat(np.arange(len(counts)), shares)
+    levels = np.stack([index >> 2 * PALETTE_BITS, index >> PALETTE_BITS, index], -1)
+    levels &= (1 << PALETTE_BITS) - 1
+    # The middle of each bin, but black and white as they are.
+    colours = (levels * MAX_8BIT / ((1 << PALETTE_BITS) - 1)).round().astype(np.uint8)
+    picture = Image.fromarray(colours[None])
+    quantised = picture.quantize(PALETTE_SIZE, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    found = np.array(quantised.getpalette(), np.uint8).reshape(-1, 3)
+    return np.pad(found, ((0, PALETTE_SIZE - len(found)), (0, 0)), "edge")
+
+
+def write_gif(
+    file: Path,
+    frames: Iterable[NDArray[np.uint8]],
+    palette: NDArray[np.uint8],
+    seconds_per_frame: float,
+) -> None:
+    """Write 8-bit frames [H, W, 3] as a GIF that loops; every pixel takes its nearest colour.
+
+    No dithering: its dots would crawl from frame to frame.
+    """
+    colours = Image.new("P", (1, 1))
+    colours.putpalette(palette.tobytes())
+    packed = (
+        Image.fromarray(frame).quantize(palette=colours, dither=Image.Dither.NONE)
+        for frame in frames
+    )
+    first = next(packed)
+    duration_ms = max(GIF_SHORTEST_MS, round(100 * seconds_per_frame) * 10)
+    first.save(
+        file,
+        "GIF",
+        save_all=True,
+        append_images=packed,
+        duration=duration_ms,
+        loop=0,
+        optimize=False,
+        disposal=1,
+    )

@@ -7,17 +7,15 @@ right of the centre is +x, the top row is +y. Radiance is linear, unbounded, Rec
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from svim3d.shading.octahedral import (
-    direction_from_octahedral,
-    sample_octahedral,
-    texel_directions,
-)
+from svim3d.shading.octahedral import sample_octahedral, texel_directions
+from svim3d.shading.resampling import SphereCells, octahedral_from_cells, weighted_blocks
 
 CHUNK_SAMPLES = 1 << 20  # sub-samples held in memory at a time while resampling
 MIN_SUBDIVISION = 2  # samples per texel side, so that a texel is a mean and not a point
+SLENDER = 0.25  # width over height of a texel from which a row's texels are merged in pairs
 
 
 def latlong_from_direction(d: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
@@ -39,41 +37,79 @@ def sample_latlong(
 ) -> Float[Tensor, "*batch c"]:
     """Bilinear lookup; wraps around in u and crosses the poles into the opposite meridian."""
     height, width, channels = latlong.shape
+    index, weight = latlong_taps(d.reshape(-1, 3), height, width)
+    found = (latlong.reshape(-1, channels)[index] * weight[..., None]).sum(1)
+    return found.view(*d.shape[:-1], channels)
+
+
+def latlong_taps(
+    d: Float[Tensor, "P 3"], height: int, width: int
+) -> tuple[Int[Tensor, "P 4"], Float[Tensor, "P 4"]]:
+    """Flat texel indices and weights of a bilinear lookup that keeps energy.
+
+    Rows towards a pole are shorter than those away from it, so that plain bilinear weights give
+    the row at the pole 8 % more of the sphere than its texels cover. Between two rows the weight
+    is therefore bent by k t (1 - t), k = (row height / 4) cot(angle of their common edge), which
+    gives every row what is its own, up to the row height squared.
+    """
     uv = latlong_from_direction(d)
     x = uv[..., 0] * width - 0.5
     y = uv[..., 1] * height - 0.5
     x0, y0 = x.floor(), y.floor()
-    fx, fy = (x - x0)[..., None], (y - y0)[..., None]
-    flat = latlong.reshape(-1, channels)
-
-    def texel(dx: int, dy: int) -> Tensor:
-        row, column = y0.long() + dy, x0.long() + dx
-        beyond = (row < 0) | (row >= height)
-        column = torch.where(beyond, column + width // 2, column) % width
-        return flat[row.clamp(0, height - 1) * width + column]
-
-    top = texel(0, 0) * (1.0 - fx) + texel(1, 0) * fx
-    bottom = texel(0, 1) * (1.0 - fx) + texel(1, 1) * fx
-    return top * (1.0 - fy) + bottom * fy
+    fx, fy = x - x0, y - y0
+    edge = (y0 + 1.0) * (math.pi / height)
+    inside = (y0 >= 0) & (y0 < height - 1)  # across a pole both rows are alike
+    bend = torch.where(inside, (0.25 * math.pi / height) / torch.tan(edge), 0.0)
+    fy = fy + bend * fy * (1.0 - fy)
+    indices, weights = [], []
+    for dy, wy in ((0, 1.0 - fy), (1, fy)):
+        for dx, wx in ((0, 1.0 - fx), (1, fx)):
+            row, column = y0.long() + dy, x0.long() + dx
+            beyond = (row < 0) | (row >= height)
+            column = torch.where(beyond, column + width // 2, column) % width
+            indices.append(row.clamp(0, height - 1) * width + column)
+            weights.append(wx * wy)
+    return torch.stack(indices, -1), torch.stack(weights, -1)
 
 
 def octahedral_from_latlong(
     latlong: Float[Tensor, "H W 3"], size: int
 ) -> Float[Tensor, "size size 3"]:
-    """Resample a lat-long picture; every texel is the mean radiance over its solid angle."""
-    subdivision = max(MIN_SUBDIVISION, math.ceil(2.0 * latlong.shape[0] / size))
-    n = size * subdivision
-    axis = (torch.arange(n, dtype=torch.float64) * 2.0 + 1.0) / n - 1.0
-    axis = axis.to(latlong)
-    rows = []
-    for block in torch.split(axis, _rows_per_chunk(subdivision, n)):
-        v, u = torch.meshgrid(block, axis, indexing="ij")
-        directions = direction_from_octahedral(torch.stack([u, v], -1))
-        # Solid angle per area of the square: |d|_1^3 for the unit direction d.
-        omega = directions.abs().sum(-1, keepdim=True) ** 3
-        radiance = sample_latlong(latlong, directions)
-        rows.append(_weighted_blocks(radiance, omega, subdivision))
-    return torch.cat(rows)
+    """Resample a lat-long picture; every texel is the mean radiance over its solid angle.
+
+    The integral over the sphere is kept exactly. `size` is even.
+    """
+    return octahedral_from_cells(latlong_cells(latlong), size)
+
+
+def latlong_cells(latlong: Float[Tensor, "H W c"]) -> SphereCells:
+    """The texels of a lat-long picture; near the poles 2, 4, 8, ... neighbours of a row are one.
+
+    Merging loses nothing: those texels are so slender that the merged cell is still narrower than
+    it is high. Unmerged, a lamp of one of them would fall between all samples.
+    """
+    height, width, channels = latlong.shape
+    # Texels of a row are this wide, in units of their height.
+    middle = (torch.arange(height, dtype=torch.float64) + 0.5) * (math.pi / height)
+    aspect = torch.sin(middle) * (2.0 * height / width)
+    pairs = torch.floor(torch.log2(2.0 * SLENDER / aspect)).clamp(0.0, 30.0)
+    merged = (2.0**pairs).long().clamp_max(width)[:, None]
+    column = torch.arange(width)[None, :] // merged
+    flat = (torch.arange(height)[:, None] * width + column).flatten()
+    _, cell = torch.unique(flat, return_inverse=True)
+    cell = cell.to(latlong.device)
+    omega = latlong_solid_angles(height, width, latlong.double()).reshape(-1, 1)
+    count = int(cell.max()) + 1
+    solid_angles = omega.new_zeros(count, 1).index_add_(0, cell, omega)
+    energy = omega.new_zeros(count, channels)
+    energy.index_add_(0, cell, latlong.reshape(-1, channels).double() * omega)
+
+    def taps(d: Float[Tensor, "P 3"]) -> tuple[Int[Tensor, "P 4"], Float[Tensor, "P 4"]]:
+        index, weight = latlong_taps(d, height, width)
+        return cell[index], weight
+
+    side = min(math.pi / height, 2.0 * math.pi / width)
+    return SphereCells((energy / solid_angles).to(latlong), solid_angles, taps, side)
 
 
 def latlong_from_octahedral(
@@ -87,7 +123,7 @@ def latlong_from_octahedral(
     for uv in torch.split(centres, _rows_per_chunk(subdivision, 2 * n)):
         directions = direction_from_latlong(uv)
         radiance = sample_octahedral(octahedral, directions.reshape(-1, 3)).view_as(directions)
-        rows.append(_weighted_blocks(radiance, torch.sin(uv[..., 1:] * math.pi), subdivision))
+        rows.append(weighted_blocks(radiance, torch.sin(uv[..., 1:] * math.pi), subdivision))
     return torch.cat(rows)
 
 
@@ -96,7 +132,7 @@ def downsample_latlong(latlong: Float[Tensor, "H W c"], factor: int) -> Float[Te
     height, width, _ = latlong.shape
     if height % factor or width % factor:
         raise ValueError(f"a {height} x {width} picture cannot be cut into {factor}-texel blocks")
-    return _weighted_blocks(latlong, latlong_solid_angles(height, width, latlong), factor)
+    return weighted_blocks(latlong, latlong_solid_angles(height, width, latlong), factor)
 
 
 def blurred_latlong(
@@ -167,13 +203,3 @@ def _texel_centres(height: int, width: int, like: Tensor) -> Float[Tensor, "heig
 def _rows_per_chunk(subdivision: int, width: int) -> int:
     """Rows of sub-samples per chunk: whole texels, bounded memory."""
     return subdivision * max(1, CHUNK_SAMPLES // (width * subdivision))
-
-
-def _weighted_blocks(
-    values: Float[Tensor, "H W c"], weights: Float[Tensor, "H W 1"], factor: int
-) -> Float[Tensor, "h w c"]:
-    """Weighted means over factor x factor blocks."""
-    height, width, channels = values.shape
-    shape = (height // factor, factor, width // factor, factor)
-    total = (values * weights).view(*shape, channels).sum((1, 3))
-    return total / weights.reshape(*shape, 1).sum((1, 3))

@@ -1,4 +1,5 @@
 import io
+import zlib
 
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ import torch
 from PIL import Image
 
 from svim3d.color import linear_from_srgb
-from svim3d.io.image import decode_image, encode_png, read_png, write_png
+from svim3d.io.image import contact_sheet, decode_image, encode_png, read_png, write_png
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
@@ -65,3 +66,30 @@ def test_what_is_no_picture_is_refused_by_name(tmp_path):
         read_png(file)
     with pytest.raises(ValueError, match="put channels last"):
         write_png(file, torch.zeros(3, 64, 64))
+
+
+def test_contact_sheet_shows_every_picture_unchanged():
+    generator = torch.Generator().manual_seed(0)
+    sizes = [(32, 48), (32, 48), (20, 48), (32, 48), (16, 16)]
+    pictures = [(torch.rand(*size, 3, generator=generator) * 255).round() / 255 for size in sizes]
+    sheet = contact_sheet(pictures, [f"{30 * i} deg" for i in range(5)], columns=3)
+    assert sheet.shape == (2 * (32 + 14 + 24), 3 * (48 + 8) + 8, 3)
+    torch.testing.assert_close(sheet[30:62, 8:56], pictures[0])
+    torch.testing.assert_close(sheet[36:56, 120:168], pictures[2])
+    assert float(sheet[8:22, 8:56].max()) > 0.8  # its label
+    with pytest.raises(ValueError, match="a label for each picture"):
+        contact_sheet(pictures, ["one"], columns=3)
+
+
+def test_huge_and_floating_point_pictures_are_refused(tmp_path):
+    file = tmp_path / "x.png"
+    header = encode_png(torch.zeros(1, 1, 1))
+    content = bytearray(header)
+    content[16:24] = (100_000).to_bytes(4, "big") * 2
+    content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=r"x\.png"):
+        read_png(file)
+    Image.fromarray(np.ones((4, 4), np.float32)).save(tmp_path / "x.tif")
+    with pytest.raises(ValueError, match=r"x\.tif: floating-point"):
+        read_png(tmp_path / "x.tif")

@@ -68,20 +68,21 @@ def test_round_trip_keeps_a_smooth_map(height):
     picture = latlong_picture(height)
     octahedral = octahedral_from_latlong(picture, 64)
     # Bilinear lookup and means over texels err by squares of sides; corner texels are wide.
-    tolerance = (math.pi / height) ** 2 + 3.0 * (math.pi / 64) ** 2
+    tolerance = (math.pi / height) ** 2 + 3.5 * (math.pi / 64) ** 2
     expected = smooth_radiance(texel_directions(64, DOUBLE))
     torch.testing.assert_close(octahedral, expected, rtol=0, atol=tolerance)
     back = latlong_from_octahedral(octahedral, height=height)
     torch.testing.assert_close(back, picture, rtol=0, atol=2 * tolerance)
 
 
-def test_downward_resampling_keeps_the_energy_of_a_lamp_of_one_texel():
+@pytest.mark.parametrize("row", [0, 1, 20, 63])  # the first and last are slivers at the poles
+def test_downward_resampling_keeps_the_energy_of_a_lamp_of_one_texel(row):
     picture = torch.zeros(64, 128, 3, dtype=torch.float64)
-    picture[20, 37] = 1000.0
+    picture[row, 37] = 1000.0
     energy = (picture * latlong_solid_angles(64, 128, picture)).sum()
     octahedral = octahedral_from_latlong(picture, 16)
     found = (octahedral * texel_solid_angles(16, DOUBLE)[..., None]).sum()
-    assert float(found / energy) == pytest.approx(1.0, abs=0.05)
+    assert float(found / energy) == pytest.approx(1.0, abs=1e-9)
 
 
 def test_mirror_ball_orientation():
