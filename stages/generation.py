@@ -16,6 +16,7 @@ from torch import Tensor
 from stages.artifacts import MaterialViews
 from stages.base import Context, Stage
 from stages.errors import InputError
+from stages.prefilter_cache import cached_operator
 from stages.settings.generation import GenerationConfig
 from svim3d.cameras import orbit_angles, orbit_cameras
 from svim3d.io.exr import read_rgb
@@ -28,7 +29,6 @@ from svim3d.render.deferred import environment_shader
 from svim3d.render.pictures import render_pictures
 from svim3d.shading.environment import octahedral_from_latlong, physical_radiance
 from svim3d.shading.octahedral import texel_directions
-from svim3d.shading.prefilter import PyramidOperator
 from svim3d.shading.studio import studio_radiance
 
 SCENE_SUFFIX = ".json"
@@ -80,7 +80,7 @@ def _from_mesh(mesh: SourceMesh, config: GenerationConfig, ctx: Context) -> Mate
     angles = orbit_angles(config.views, config.elevation_mean_deg, config.elevation_swing_deg)
     cameras = orbit_cameras(angles, radius=radius, fov_y_deg=config.fov_y_deg, size=config.size)
     light = _environment(config, ctx)
-    shader = environment_shader(PyramidOperator.build(config.environment_size)(light))
+    shader = environment_shader(cached_operator(ctx.shared, config.environment_size)(light))
     views = []
     for view in range(len(cameras)):
         pictures = render_pictures(mesh, cameras[view], shader, supersample=config.supersample)
