@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from stages.artifacts import FittedField, MaterialViews, RefinedSurface
 from stages.base import Context, Stage
 from stages.errors import DivergenceError, InputError
+from stages.prefilter_cache import cached_operator
 from stages.settings.dmtet import DmtetConfig
 from svim3d.cameras import Cameras
 from svim3d.fields.material_field import MaterialField
@@ -231,7 +232,7 @@ def _optimise(
     fit: _Fit, cameras: Cameras, planes: dict[str, Tensor], config: DmtetConfig, ctx: Context
 ) -> None:
     """The loop."""
-    operator = PyramidOperator.build(fit.environment.shape[0])
+    operator = cached_operator(ctx.shared, fit.environment.shape[0])
     saved = ctx.checkpoints.load()
     first = 0
     if saved is not None:

@@ -20,10 +20,10 @@ from torch import Tensor
 from stages.artifacts import EnvironmentLight, MaterialViews
 from stages.base import Context, Stage
 from stages.errors import InputError
+from stages.prefilter_cache import cached_operator
 from stages.settings.env_preopt import EnvPreoptConfig
 from svim3d.numerics import dot, normalize
 from svim3d.shading.octahedral import total_variation
-from svim3d.shading.prefilter import PyramidOperator
 from svim3d.shading.stored_shading import StoredShading
 
 BLACK_LEVEL = 0.02  # of the mean radiance: below it the square root no longer magnifies noise
@@ -40,7 +40,7 @@ def run(views: MaterialViews, *, config: EnvPreoptConfig, ctx: Context) -> Envir
     """
     pixels = _usable_pixels(views, config, ctx)
     radiance = pixels.pop("radiance").to(ctx.device)
-    operator = PyramidOperator.build(config.size, config.prefilter)
+    operator = cached_operator(ctx.shared, config.size, config.prefilter)
     shading = StoredShading.build(
         **{name: value.to(ctx.device) for name, value in pixels.items()},
         layout=operator.layout,

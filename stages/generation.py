@@ -14,6 +14,7 @@ from torch import Tensor
 from stages.artifacts import MaterialViews
 from stages.base import Context, Stage
 from stages.errors import InputError
+from stages.prefilter_cache import cached_operator
 from stages.settings.generation import GenerationConfig
 from svim3d.cameras import fitting_radius, orbit_angles, orbit_cameras
 from svim3d.io.glb import read_mesh
@@ -25,7 +26,6 @@ from svim3d.mesh.source_mesh import SourceMesh, normalised
 from svim3d.render.deferred import environment_shader
 from svim3d.render.pictures import render_pictures
 from svim3d.shading.octahedral import texel_directions
-from svim3d.shading.prefilter import PyramidOperator
 from svim3d.shading.studio import studio_radiance
 
 SCENE_SUFFIX = ".json"
@@ -66,7 +66,7 @@ def _from_mesh(mesh: SourceMesh, config: GenerationConfig, ctx: Context) -> Mate
     angles = orbit_angles(config.views, config.elevation_mean_deg, config.elevation_swing_deg)
     cameras = orbit_cameras(angles, radius=radius, fov_y_deg=config.fov_y_deg, size=config.size)
     light = _environment(config, ctx)
-    shader = environment_shader(PyramidOperator.build(config.environment_size)(light))
+    shader = environment_shader(cached_operator(ctx.shared, config.environment_size)(light))
     views = []
     for view in range(len(cameras)):
         pictures = render_pictures(mesh, cameras[view], shader, supersample=config.supersample)

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
 from stages.base import Context, Stage
 from stages.errors import InputError
+from stages.prefilter_cache import cached_operator
 from stages.settings.nerf import NerfConfig
 from svim3d.cameras import Cameras
 from svim3d.fields.distance import signed_distance, without_hidden_parts
@@ -29,7 +30,6 @@ from svim3d.render.march import hits_surface
 from svim3d.render.pixel_blocks import PIXELS, PixelBlocks
 from svim3d.render.volumes import DensityVolume, SdfVolume
 from svim3d.render.volumetric import Rendered, render_rays
-from svim3d.shading.prefilter import PyramidOperator
 
 log = logging.getLogger(__name__)
 
@@ -273,7 +273,7 @@ def _draw(blocks: PixelBlocks, step: int, config: NerfConfig, ctx: Context) -> P
 
 def _optimise(fit: _Fit, blocks: PixelBlocks, config: NerfConfig, ctx: Context) -> None:
     """The loop. State is saved where the empty-space grid is a function of the parameters."""
-    operator = PyramidOperator.build(len(fit.log_environment))
+    operator = cached_operator(ctx.shared, len(fit.log_environment))
     first = _resume(fit, config, ctx)
     for step in range(first, config.steps):
         if step % REFRESH_EVERY == 0:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from stages.artifacts import ExportedAsset, FittedField, MaterialViews
 from stages.base import Context, Stage
+from stages.prefilter_cache import cached_operator
 from stages.settings.preview import PreviewConfig
 from svim3d.color import srgb_from_linear
 from svim3d.io.exr import read_rgb
@@ -26,7 +27,6 @@ from svim3d.metrics import mean_angle_deg, psnr
 from svim3d.render.deferred import environment_shader
 from svim3d.render.pictures import render_pictures
 from svim3d.shading.environment import latlong_from_octahedral, octahedral_from_latlong
-from svim3d.shading.prefilter import PyramidOperator
 from svim3d.shading.tonemap import agx
 
 LIGHT_FILE = "environment.exr"
@@ -80,7 +80,7 @@ def run(
     """Render the asset in some cameras of the views and lay all out on one sheet."""
     chosen = _chosen_views(len(views.cameras), views.reference, config.views)
     light = _light(field, asset, ctx)
-    shader = environment_shader(PyramidOperator.build(light.shape[0])(light))
+    shader = environment_shader(cached_operator(ctx.shared, light.shape[0])(light))
     file = ctx.work / "asset.glb"
     file.write_bytes(asset.files["asset.glb"])
     rendered = render_pictures(

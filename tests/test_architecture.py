@@ -28,7 +28,13 @@ MIDDLE = (
     "diffusion",
 )
 TIER_1 = tuple(f"svim3d.{name}" for name in MIDDLE)
-CONTRACT = ("stages.base", "stages.artifacts", "stages.errors", "stages.settings")
+CONTRACT = (
+    "stages.base",
+    "stages.artifacts",
+    "stages.errors",
+    "stages.prefilter_cache",
+    "stages.settings",
+)
 MAY_IMPORT = {
     "svim3d": BASICS,
     "svim3d.render": (*BASICS, *TIER_1),
@@ -40,6 +46,7 @@ MAY_IMPORT = {
     "stages.base": ("svim3d", "stages.errors"),
     "stages.artifacts": ("svim3d",),
     "stages.keys": ("stages.errors",),
+    "stages.prefilter_cache": ("svim3d", "stages.keys"),
     "stages.manifest": ("stages.keys",),
     "stages.store": ("stages.keys", "stages.manifest", "stages.errors"),
     "stages.execution": (*CONTRACT, "stages.keys", "stages.store"),

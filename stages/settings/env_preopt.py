@@ -12,8 +12,9 @@ class EnvPreoptConfig(StageConfig):
 
     size: Literal[16, 32, 64, 128, 256] = 128
     """Side of the octahedral environment map, texels (SViM3D optimises at low resolution)."""
-    prefilter: Literal["exact", "sampled"] = "exact"
-    """How the pyramid is filtered: the lobes' own integrals, or the paper's few samples."""
+    prefilter: Literal["exact", "hybrid", "sampled"] = "exact"
+    """How the pyramid is filtered: the lobes' own integrals, these with samples where lobes are
+    narrow, or the paper's few samples."""
     steps: int = Field(200, ge=1, le=100_000)
     """Full-batch Adam steps (SViM3D, section 4)."""
     learning_rate: float = Field(0.3, gt=0.0, le=10.0)

@@ -1,9 +1,10 @@
 """Stored sparse matrices as differentiable functions.
 
 Whatever is linear in the unknowns (the prefilter, the lookup of a fixed set of pixels) is computed
-once as a matrix; its gradient is the product with the transpose, which is stored beside it.
+once as a matrix; its gradient is the product with the transpose, which is made when first needed.
 """
 
+import functools
 from typing import Any
 
 import numba
@@ -26,10 +27,14 @@ class SparseOperator:
     """
 
     def __init__(self, matrix: scipy.sparse.csr_matrix) -> None:
-        """Keep `matrix` and its transpose; duplicates must be summed already."""
+        """Keep `matrix`; duplicates must be summed already."""
         self.shape: tuple[int, int] = matrix.shape
         self.forward_matrix = CsrMatrix(matrix)
-        self.adjoint_matrix = CsrMatrix(matrix.T.tocsr())
+
+    @functools.cached_property
+    def adjoint_matrix(self) -> "CsrMatrix":
+        """The transpose, made when the first gradient asks for it."""
+        return CsrMatrix(self.forward_matrix.scipy().T.tocsr())
 
     @property
     def stored(self) -> int:
@@ -38,12 +43,12 @@ class SparseOperator:
 
     def __call__(self, x: Float[Tensor, "columns c"]) -> Float[Tensor, "rows c"]:
         """The product; differentiable in `x`."""
-        product: Tensor = _Product.apply(x, self.forward_matrix, self.adjoint_matrix)  # type: ignore[no-untyped-call]
+        product: Tensor = _Product.apply(x, self, False)  # type: ignore[no-untyped-call]
         return product
 
     def adjoint(self, y: Float[Tensor, "rows c"]) -> Float[Tensor, "columns c"]:
         """The product with the transpose; differentiable in `y`."""
-        product: Tensor = _Product.apply(y, self.adjoint_matrix, self.forward_matrix)  # type: ignore[no-untyped-call]
+        product: Tensor = _Product.apply(y, self, True)  # type: ignore[no-untyped-call]
         return product
 
 
@@ -52,11 +57,15 @@ class CsrMatrix:
 
     def __init__(self, matrix: scipy.sparse.csr_matrix) -> None:
         self.pointers: NDArray[np.int64] = matrix.indptr.astype(np.int64)
-        self.columns: NDArray[np.int32] = matrix.indices.astype(np.int32)
+        self.columns: NDArray[np.int32] = matrix.indices.astype(np.int32, copy=False)
         self.values: NDArray[Any] = matrix.data
         self.shape: tuple[int, int] = matrix.shape
         self._values: dict[np.dtype[Any], NDArray[Any]] = {}
         self._tensors: dict[tuple[torch.device, torch.dtype], Tensor] = {}
+
+    def scipy(self) -> scipy.sparse.csr_matrix:
+        """The matrix for scipy, sharing memory."""
+        return scipy.sparse.csr_matrix((self.values, self.columns, self.pointers), self.shape)
 
     def multiply(self, x: Tensor) -> Tensor:
         """The product, without a gradient, on the device and in the dtype of `x`."""
@@ -64,7 +73,7 @@ class CsrMatrix:
             return self.tensor(x) @ x
         dense = x.detach().contiguous().numpy()
         if dense.dtype not in self._values:
-            self._values[dense.dtype] = self.values.astype(dense.dtype)
+            self._values[dense.dtype] = self.values.astype(dense.dtype, copy=False)
         product = np.empty((self.shape[0], dense.shape[1]), dense.dtype)
         _multiply(self.pointers, self.columns, self._values[dense.dtype], dense, product)
         return torch.from_numpy(product)
@@ -86,13 +95,14 @@ class _Product(torch.autograd.Function):
     """y = A x, dx = A^T dy."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, matrix: CsrMatrix, transpose: CsrMatrix) -> Tensor:
-        ctx.transpose = transpose
-        return matrix.multiply(x)
+    def forward(ctx: Any, x: Tensor, operator: SparseOperator, transposed: bool) -> Tensor:
+        ctx.operator, ctx.transposed = operator, transposed
+        return (operator.adjoint_matrix if transposed else operator.forward_matrix).multiply(x)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        return ctx.transpose.multiply(grad), None, None
+        back = ctx.operator.forward_matrix if ctx.transposed else ctx.operator.adjoint_matrix
+        return back.multiply(grad), None, None
 
 
 @kernel(parallel=True)

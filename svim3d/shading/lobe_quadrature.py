@@ -8,6 +8,7 @@ once, and the mips hold the same energy, so nothing is cut off however long the 
 """
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
@@ -21,7 +22,7 @@ TAIL_EXPONENT = 1.0  # how much faster than the lobe's length scale texels grow 
 HALF_DIAGONAL = 0.7  # of a square texel, over its side
 SUBDIVISION = 4  # points per side at which a lobe narrower than a texel is averaged
 MAX_WAITING = 128  # nodes on the traversal stack: the coarsest mip's 16 and 3 per further mip
-MAX_NODES = 1024  # stored entries of one row; 40 to 250 are used
+MAX_NODES = 1024  # stored entries of one row; 40 to 500 are used
 ROWS_PER_CHUNK = 2048  # bounds memory while rows are built
 
 
@@ -36,6 +37,12 @@ def exact_rows(
         roughness: perceptual roughness of the GGX lobe, or None for the cosine lobe.
         accuracy: side over the lobe's local length scale (a radian at most) below which a texel
             may stand for all texels below it. The error under one small lamp is about a tenth.
+
+    Returns:
+        Weights in float32, columns in int32.
+
+    Raises:
+        ValueError: a row would have more than MAX_NODES entries.
     """
     # The GGX lobe of width 1 times the cosine is the cosine lobe.
     alpha = 1.0 if roughness is None else roughness * roughness
@@ -44,12 +51,11 @@ def exact_rows(
     offsets = np.cumsum([0, *(n * n for n in mips)])
     directions = np.concatenate([_directions(n) for n in mips])
     omega = np.concatenate([texel_solid_angles(n, DOUBLE).numpy().ravel() for n in mips])
-    fine = _directions(mips[0] * SUBDIVISION)
     blocks = []
     for start in range(0, len(axes), ROWS_PER_CHUNK):
         chunk = axes[start : start + ROWS_PER_CHUNK]
-        columns = np.zeros((len(chunk), MAX_NODES), np.int64)
-        weights = np.zeros((len(chunk), MAX_NODES))
+        columns = np.empty((len(chunk), MAX_NODES), np.int32)
+        weights = np.empty((len(chunk), MAX_NODES), np.float32)
         counts = np.zeros(len(chunk), np.int64)
         _integrate(
             chunk,
@@ -59,16 +65,20 @@ def exact_rows(
             offsets,
             directions,
             omega,
-            fine,
             columns,
             weights,
             counts,
         )
+        if counts.min() < 0:
+            raise ValueError(
+                f"accuracy {accuracy:g} at roughness {roughness} needs more than {MAX_NODES} "
+                "entries in a row; ask for a larger accuracy value"
+            )
         used = np.arange(MAX_NODES) < counts[:, None]
         pointers = np.concatenate([[0], np.cumsum(counts)])
         shape = (len(chunk), int(offsets[-1]))
         blocks.append(scipy.sparse.csr_matrix((weights[used], columns[used], pointers), shape))
-    return scipy.sparse.vstack(blocks).tocsr()
+    return scipy.sparse.vstack(blocks, format="csr")
 
 
 def _directions(n: int) -> NDArray[np.float64]:
@@ -86,12 +96,14 @@ def _integrate(
     offsets: NDArray[np.int64],
     directions: NDArray[np.float64],
     omega: NDArray[np.float64],
-    fine: NDArray[np.float64],
-    columns: NDArray[np.int64],
-    weights: NDArray[np.float64],
+    columns: NDArray[np.int32],
+    weights: NDArray[np.float32],
     counts: NDArray[np.int64],
 ) -> None:
-    """Columns and normalised weights of one row per axis, from the coarsest mip downwards."""
+    """Columns and normalised weights of one row per axis, from the coarsest mip downwards.
+
+    A count of -1 says that a row has no room for its entries.
+    """
     coarsest = len(sizes) - 1
     for row in numba.prange(len(axes)):
         waiting = np.empty((MAX_WAITING, 2), np.int64)
@@ -114,14 +126,13 @@ def _integrate(
                         waiting[length, 1] = (2 * i + child // 2) * 2 * size + 2 * j + child % 2
                         length += 1
                     continue
-                value = 0.0
-                for k in range(SUBDIVISION * SUBDIVISION):
-                    y, x = i * SUBDIVISION + k // SUBDIVISION, j * SUBDIVISION + k % SUBDIVISION
-                    value += _lobe(axes[row], fine[y * size * SUBDIVISION + x], alpha)
-                value *= omega[entry] / (SUBDIVISION * SUBDIVISION)
+                value = _texel_mean(axes[row], i, j, size, alpha) * omega[entry]
             else:
                 value = _lobe(axes[row], directions[entry], alpha) * omega[entry]
             if value > 0.0:
+                if count == columns.shape[1]:
+                    count = -1
+                    break
                 columns[row, count] = entry
                 weights[row, count] = value
                 count += 1
@@ -132,7 +143,29 @@ def _integrate(
 
 
 @kernel()
-def _lobe(axis: NDArray[np.float64], wi: NDArray[np.float64], alpha: float) -> float:
+def _texel_mean(axis: NDArray[np.float64], i: int, j: int, size: int, alpha: float) -> float:
+    """Mean of the lobe over texel (row i, column j) of the map."""
+    points = size * SUBDIVISION
+    value = 0.0
+    for k in range(SUBDIVISION * SUBDIVISION):
+        y, x = i * SUBDIVISION + k // SUBDIVISION, j * SUBDIVISION + k % SUBDIVISION
+        value += _lobe(axis, _direction(y, x, points), alpha)
+    return value / (SUBDIVISION * SUBDIVISION)
+
+
+@kernel()
+def _direction(i: int, j: int, size: int) -> tuple[float, float, float]:
+    """Unit direction of a texel centre; `octahedral.texel_directions` for one texel."""
+    u, v = (2.0 * j + 1.0) / size - 1.0, (2.0 * i + 1.0) / size - 1.0
+    y = 1.0 - abs(u) - abs(v)
+    fold = max(0.0, -y)
+    x, z = u - math.copysign(fold, u), v - math.copysign(fold, v)
+    norm = math.sqrt(x * x + y * y + z * z)
+    return x / norm, y / norm, z / norm
+
+
+@kernel()
+def _lobe(axis: NDArray[np.float64], wi: Any, alpha: float) -> float:
     """D(h) n.wi for view = normal = axis, up to a constant factor."""
     cosine = axis[0] * wi[0] + axis[1] * wi[1] + axis[2] * wi[2]
     if cosine <= 0.0:

@@ -14,12 +14,11 @@ from torch import Tensor
 from svim3d.numerics import normalize
 from svim3d.shading.octahedral import bilinear_taps, texel_directions
 
-LOD_BIAS = 1.0  # one mip coarser than one sample's share: halves the error at 4 to 256 samples
-ROWS_PER_CHUNK = 4096  # bounds memory while rows are built
+ENTRIES_PER_CHUNK = 1 << 21  # bounds memory while rows are built, about 100 bytes each
 
 
 def sampled_rows(
-    size: int, mips: tuple[int, ...], roughness: float | None, samples: int
+    size: int, mips: tuple[int, ...], roughness: float | None, samples: int, lod_bias: float
 ) -> scipy.sparse.csr_matrix:
     """Rows of a size x size level: weights over the mip stack whose sides are `mips`.
 
@@ -28,6 +27,10 @@ def sampled_rows(
         mips: sides of the map and its mips, finest first.
         roughness: perceptual roughness of the GGX lobe, or None for the cosine lobe.
         samples: directions per texel, shared by all texels (Halton points in bases 2 and 3).
+        lod_bias: mips coarser than a sample's share of the lobe at which it is read.
+
+    Returns:
+        Weights in float32, columns in int32.
     """
     if roughness is None:
         local, density, weight = cosine_lobe_samples(samples)
@@ -37,10 +40,10 @@ def sampled_rows(
     share = 1.0 / (samples * density)
     offsets = np.cumsum([0, *(n * n for n in mips)])
     blocks = [
-        _chunk_rows(chunk, local, share, weight / weight.sum(), mips, offsets)
-        for chunk in torch.split(normals, ROWS_PER_CHUNK)
+        _chunk_rows(chunk, local, share, weight / weight.sum(), mips, offsets, lod_bias)
+        for chunk in torch.split(normals, max(1, ENTRIES_PER_CHUNK // (8 * len(local))))
     ]
-    return scipy.sparse.vstack(blocks).tocsr()
+    return scipy.sparse.vstack(blocks, format="csr")
 
 
 def halton(count: int, base: int) -> Float[Tensor, "count"]:
@@ -110,14 +113,14 @@ def tangent_frame(
 
 
 def sample_lod(
-    direction: Float[Tensor, "P 3"], share: float, size: int, coarsest: int
+    direction: Float[Tensor, "P 3"], share: float, size: int, coarsest: int, lod_bias: float
 ) -> Float[Tensor, "P 1"]:
-    """Mip whose texels match a sample's share of solid angle.
+    """Mip whose texels match a sample's share of solid angle, and `lod_bias` more.
 
     The texel of a size^2 map towards the unit direction d covers 4 |d|_1^3 / size^2 steradian.
     """
     texel = 4.0 * direction.abs().sum(-1, keepdim=True) ** 3 / size**2
-    return (0.5 * torch.log2(share / texel) + LOD_BIAS).clamp(0.0, coarsest)
+    return (0.5 * torch.log2(share / texel) + lod_bias).clamp(0.0, coarsest)
 
 
 def _chunk_rows(
@@ -127,6 +130,7 @@ def _chunk_rows(
     weight: Float[Tensor, "S 1"],
     mips: tuple[int, ...],
     offsets: np.ndarray,
+    lod_bias: float,
 ) -> scipy.sparse.csr_matrix:
     """Rows of one chunk of output texels."""
     tangent, bitangent = tangent_frame(normals)
@@ -136,7 +140,7 @@ def _chunk_rows(
     for s in range(len(local)):
         x, y, z = local[s].tolist()
         direction = normalize(x * tangent + y * bitangent + z * normals)
-        lod = sample_lod(direction, float(share[s]), mips[0], len(mips) - 1)
+        lod = sample_lod(direction, float(share[s]), mips[0], len(mips) - 1, lod_bias)
         lower = lod.floor().clamp_max(len(mips) - 2)
         for step in (0, 1):
             level = lower[:, 0].long() + step
@@ -144,10 +148,10 @@ def _chunk_rows(
             taps, bilinear = bilinear_taps(direction, sizes[level])
             columns.append(taps + starts[level][:, None])
             values.append(bilinear * trilinear * float(weight[s]))
-    rows = np.repeat(np.arange(len(normals)), 4 * len(columns))
-    matrix = scipy.sparse.csr_matrix(
-        (torch.cat(values, 1).numpy().ravel(), (rows, torch.cat(columns, 1).numpy().ravel())),
-        (len(normals), int(offsets[-1])),
-    )
+    pointers = np.arange(len(normals) + 1) * 4 * len(columns)
+    flat = torch.cat(columns, 1).to(torch.int32).numpy().ravel()
+    shape = (len(normals), int(offsets[-1]))
+    matrix = scipy.sparse.csr_matrix((torch.cat(values, 1).numpy().ravel(), flat, pointers), shape)
+    matrix.sum_duplicates()
     matrix.eliminate_zeros()
-    return matrix
+    return matrix.astype(np.float32)

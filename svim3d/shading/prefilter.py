@@ -1,20 +1,21 @@
 """The prefiltered environment pyramid: radiance blurred by the GGX lobe of each roughness.
 
 Prefiltering is linear in the radiance, so it is stored as two sparse operators: the map to its mip
-stack, and the mip stack to all levels and the irradiance map. Two ways to fill the second:
+stack, and the mip stack to all levels and the irradiance map. `prefilter_spec` says which levels
+there are and how each row of the second is filled:
 
-- `sampled`: the paper's scheme, a few importance samples per texel, each read from a mip that
-  matches its share of the lobe (filtered importance sampling).
-- `exact`: the integral of the lobe itself, as a quadrature that is fine near the lobe's axis and
-  coarse in its tail (see `lobe_quadrature`).
+- by `lobe_sampling`, as the paper does: a few importance samples per texel, each read from a mip
+  that matches its share of the lobe (filtered importance sampling);
+- by `lobe_quadrature`: the integral of the lobe itself, fine near its axis and coarse in its tail.
 
 Level 0 is the map itself. The lobe assumes view, normal and reflection to coincide, as every
 split-sum approximation does.
 """
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 import scipy.sparse
@@ -31,19 +32,20 @@ from svim3d.shading.octahedral import (
     sample_octahedral,
     texel_solid_angles,
 )
+from svim3d.shading.prefilter_spec import (
+    IRRADIANCE_SIZE,
+    SMALLEST_MIP,
+    Integral,
+    PrefilterMode,
+    PrefilterProfile,
+    PrefilterSpec,
+)
 
-PrefilterMode = Literal["sampled", "exact"]
-SMALLEST_MIP = 4  # a 4 x 4 map still tells up from down
-SAMPLED_ROUGHNESS = (0.0, 0.25, 0.5, 0.75, 1.0)  # Source: SViM3D, section 4
-SAMPLED_COUNTS = (4, 16, 24, 24)  # Source: SViM3D, section 4; level 0 is not filtered
-SAMPLED_IRRADIANCE_COUNT = 16  # Source: SViM3D, section 4
-SAMPLED_SHIFT = (0, 1, 2, 3, 4)  # each level has half the side of the one before
-# Steps of about two in lobe width keep the blend of two levels within 2 % under a broad light.
-EXACT_ROUGHNESS = (0.0, 0.1, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0)
-EXACT_SHIFT = (0, 0, 1, 1, 2, 2, 2, 2)  # a texel is at most half as wide as the level's lobe
-EXACT_ACCURACY = (0.7, 0.7, 0.7, 0.35, 0.35, 0.35, 0.35)  # coarse levels are cheap to do well
-SMALLEST_LEVEL = 8  # keeps the widest lobe's gradient
-IRRADIANCE_SIZE = 32  # at the map's creases bilinear lookup is off by half a texel's slope
+TENSOR_NAMES = tuple(
+    f"{operator}.{part}"
+    for operator in ("pool", "prefilter")
+    for part in ("pointers", "columns", "values", "shape")
+)
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,13 @@ class PyramidLayout:
     roughness: tuple[float, ...]
     sizes: tuple[int, ...]
     irradiance_size: int = IRRADIANCE_SIZE
+
+    @classmethod
+    def of(cls, spec: PrefilterSpec) -> Self:
+        """The layout of a spec's pyramid: the map itself, then its levels."""
+        *levels, irradiance = spec.levels()
+        roughness = (0.0, *(level.roughness or 0.0 for level in levels))
+        return cls(roughness, (spec.size, *(level.size for level in levels)), irradiance.size)
 
     @property
     def offsets(self) -> tuple[int, ...]:
@@ -123,42 +132,76 @@ class PyramidOperator:
     """The linear map from an octahedral environment to its pyramid.
 
     Attributes:
-        size: side of the environment map.
-        layout: levels of the pyramid.
+        spec: what it was built from.
         pool: map texels to the stack of all mips.
         prefilter: mip stack to levels 1.. and the irradiance map.
     """
 
-    size: int
-    layout: PyramidLayout
+    spec: PrefilterSpec
     pool: SparseOperator
     prefilter: SparseOperator
 
+    @property
+    def size(self) -> int:
+        """Side of the environment map."""
+        return self.spec.size
+
+    @functools.cached_property
+    def layout(self) -> PyramidLayout:
+        """Levels of the pyramid."""
+        return PyramidLayout.of(self.spec)
+
     @classmethod
     @functools.lru_cache(maxsize=4)
-    def build(cls, size: int = 128, mode: PrefilterMode = "exact") -> Self:
-        """Build the operator for size x size maps, size a power of two; about 0.5 s at 128."""
-        if size < 2 * SMALLEST_MIP or size & (size - 1):
-            raise ValueError(f"the environment's size must be a power of two >= 8, got {size}")
+    def build(
+        cls,
+        size: int = 128,
+        mode: PrefilterMode = "exact",
+        profile: PrefilterProfile = "optimisation",
+    ) -> Self:
+        """Compute the operator, or hand out the one that was computed before.
+
+        Raises:
+            ValueError: see `PrefilterSpec`.
+        """
+        spec = PrefilterSpec(size, mode, profile)
         mips = mip_sizes(size)
-        if mode == "sampled":
-            layout = _layout(size, SAMPLED_ROUGHNESS, SAMPLED_SHIFT)
-            levels = list(zip(layout.sizes, layout.roughness, strict=True))[1:]
-            blocks = [
-                sampled_rows(n, mips, r, count)
-                for (n, r), count in zip(levels, SAMPLED_COUNTS, strict=True)
-            ]
-            blocks.append(sampled_rows(IRRADIANCE_SIZE, mips, None, SAMPLED_IRRADIANCE_COUNT))
-        else:
-            layout = _layout(size, EXACT_ROUGHNESS, EXACT_SHIFT)
-            levels = list(zip(layout.sizes, layout.roughness, strict=True))[1:]
-            blocks = [
-                exact_rows(n, mips, r, accuracy)
-                for (n, r), accuracy in zip(levels, EXACT_ACCURACY, strict=True)
-            ]
-            blocks.append(exact_rows(IRRADIANCE_SIZE, mips, None, EXACT_ACCURACY[-1]))
-        prefilter = SparseOperator(scipy.sparse.vstack(blocks).tocsr())
-        return cls(size, layout, SparseOperator(pooling_matrix(size)), prefilter)
+        blocks = [
+            exact_rows(level.size, mips, level.roughness, level.filter.accuracy)
+            if isinstance(level.filter, Integral)
+            else sampled_rows(
+                level.size, mips, level.roughness, level.filter.count, level.filter.lod_bias
+            )
+            for level in spec.levels()
+        ]
+        prefilter = SparseOperator(scipy.sparse.vstack(blocks, format="csr"))
+        return cls(spec, SparseOperator(pooling_matrix(size)), prefilter)
+
+    def to_tensors(self) -> dict[str, Tensor]:
+        """Both matrices as named tensors, which share memory with the operator."""
+        tensors = {}
+        for name, operator in (("pool", self.pool), ("prefilter", self.prefilter)):
+            matrix = operator.forward_matrix
+            tensors[f"{name}.pointers"] = torch.from_numpy(matrix.pointers)
+            tensors[f"{name}.columns"] = torch.from_numpy(matrix.columns)
+            tensors[f"{name}.values"] = torch.from_numpy(matrix.values)
+            tensors[f"{name}.shape"] = torch.tensor(matrix.shape)
+        return tensors
+
+    @classmethod
+    def from_tensors(cls, spec: PrefilterSpec, tensors: Mapping[str, Tensor]) -> Self:
+        """The operator of `spec` from what `to_tensors` gave, bit for bit.
+
+        Raises:
+            ValueError: the tensors are not those of this spec, or are damaged.
+        """
+        stack = sum(n * n for n in mip_sizes(spec.size))
+        texels = PyramidLayout.of(spec).offsets[-1] - spec.size**2
+        shapes = {"pool": (stack, spec.size**2), "prefilter": (texels, stack)}
+        if set(tensors) != set(TENSOR_NAMES):
+            raise ValueError(f"a stored prefilter has the tensors {TENSOR_NAMES}, got {[*tensors]}")
+        operators = [_restored(name, tensors, shape) for name, shape in shapes.items()]
+        return cls(spec, *operators)
 
     def __call__(self, radiance: Float[Tensor, "n n 3"]) -> EnvironmentPyramid:
         """Prefilter a map; differentiable."""
@@ -193,9 +236,29 @@ def pooling_matrix(size: int) -> scipy.sparse.csr_matrix:
         weights = omega / np.bincount(parent, omega)[parent]
         shape = (n * n, size * size)
         blocks.append(scipy.sparse.csr_matrix((weights, (parent, np.arange(size * size))), shape))
-    return scipy.sparse.vstack(blocks).tocsr()
+    return scipy.sparse.vstack(blocks, format="csr").astype(np.float32)
 
 
-def _layout(size: int, roughness: tuple[float, ...], shifts: tuple[int, ...]) -> PyramidLayout:
-    """Levels whose sides are `size` halved `shifts` times."""
-    return PyramidLayout(roughness, tuple(max(size >> shift, SMALLEST_LEVEL) for shift in shifts))
+def _restored(name: str, tensors: Mapping[str, Tensor], shape: tuple[int, int]) -> SparseOperator:
+    """One operator from its tensors, checked so that a product cannot leave its memory."""
+    pointers, columns, values, stored = (
+        tensors[f"{name}.{part}"] for part in ("pointers", "columns", "values", "shape")
+    )
+    whole = (
+        stored.tolist() == list(shape)
+        and (pointers.dtype, columns.dtype, values.dtype)
+        == (torch.int64, torch.int32, torch.float32)
+        and len(pointers) == shape[0] + 1
+        and int(pointers[0]) == 0
+        and int(pointers[-1]) == len(columns) == len(values)
+        and bool((pointers[1:] >= pointers[:-1]).all())
+        and 0 <= int(columns.min()) <= int(columns.max()) < shape[1]
+        and bool(torch.isfinite(values).all())
+    )
+    if not whole:
+        raise ValueError(
+            f"the stored matrix {name} is damaged or not the {shape[0]} x {shape[1]} one that this "
+            "spec needs; build it anew"
+        )
+    matrix = scipy.sparse.csr_matrix((values.numpy(), columns.numpy(), pointers.numpy()), shape)
+    return SparseOperator(matrix)

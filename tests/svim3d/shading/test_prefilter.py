@@ -48,7 +48,7 @@ def brute_force(radiance, axes, alpha, subdivision=8):
     return (lobe @ fine.reshape(-1, 3)) / lobe.sum(1, keepdim=True)
 
 
-@pytest.mark.parametrize("mode", ["sampled", "exact"])
+@pytest.mark.parametrize("mode", ["sampled", "exact", "hybrid"])
 def test_constant_environment_gives_constant_pyramid(mode):
     operator = PyramidOperator.build(SIZE, mode)
     pyramid = operator(torch.full((SIZE, SIZE, 3), 1.75, dtype=torch.float64))
@@ -85,11 +85,11 @@ def test_exact_rows_match_brute_force(roughness):
 
 
 def test_exact_rows_count_every_direction_once():
-    # Weights are positive, sum to one, and a texel and its mips never overlap.
+    # Weights are positive, sum to one within float32, and a texel and its mips never overlap.
     mips = mip_sizes(SIZE)
     matrix = exact_rows(SIZE, mips, 0.3, 0.7)
     assert float(matrix.data.min()) > 0.0
-    np.testing.assert_allclose(np.asarray(matrix.sum(1)), 1.0, atol=1e-12)
+    np.testing.assert_allclose(matrix.astype(float).sum(1), 1.0, atol=5e-7)
     covered = (matrix != 0).astype(float) @ (pooling_matrix(SIZE) != 0).astype(float)
     assert covered.max() == 1.0
 
@@ -124,13 +124,15 @@ def test_sampled_rows_equal_the_direct_loop(roughness):
         tangent, bitangent = tangent_frame(normal)
         for s in range(len(local)):
             d = local[s, 0] * tangent + local[s, 1] * bitangent + local[s, 2] * normal
-            lod = float(sample_lod(d, float(1.0 / (samples * density[s])), SIZE, len(mips) - 1))
+            lod = float(
+                sample_lod(d, float(1.0 / (samples * density[s])), SIZE, len(mips) - 1, 1.0)
+            )
             lower = min(int(lod), len(mips) - 2)
             blend = lod - lower
             value = (1 - blend) * sample_octahedral(maps[lower], d)
             value = value + blend * sample_octahedral(maps[lower + 1], d)
             expected[index] += (weight[s] / weight.sum() * value)[0]
-    found = torch.from_numpy(sampled_rows(n, mips, roughness, samples) @ stack.numpy())
+    found = torch.from_numpy(sampled_rows(n, mips, roughness, samples, 1.0) @ stack.numpy())
     torch.testing.assert_close(found, expected)
 
 
@@ -141,7 +143,7 @@ def test_sampled_lobes_converge_to_the_exact_ones():
     stack, mips = pooling_matrix(32) @ radiance.view(-1, 3).numpy(), mip_sizes(32)
     for roughness in (0.5, 1.0):
         exact = exact_rows(8, mips, roughness, 0.1) @ stack
-        few, many = (sampled_rows(8, mips, roughness, n) @ stack for n in (16, 256))
+        few, many = (sampled_rows(8, mips, roughness, n, 1.0) @ stack for n in (16, 256))
         assert np.abs(many - exact).mean() < 0.01
         assert np.abs(many - exact).mean() < 0.5 * np.abs(few - exact).mean()
 
