@@ -11,11 +11,10 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
-from flows.pipeline import IMAGE_TO_ASSET
+from flows.options import job_options, relight_options
 
 DONE, FAILED, BAD_INPUT, CANCELLED = 0, 1, 2, 130
 DEFAULT_STORE = Path(".svim3d")
-STAGES = ", ".join(IMAGE_TO_ASSET.names)
 
 # Thread pools that spin while they wait starve each other: two of them on two cores made the
 # slowest tenth of 23 ms steps six times as long. Must be set before torch is imported.
@@ -54,6 +53,10 @@ def _dispatch(options: argparse.Namespace) -> int:
         from flows.doctor import doctor
 
         return doctor(options.store)
+    if options.command == "relight":
+        from flows.relight import relight
+
+        return relight(options)
     from flows import commands
 
     if options.command == "presets":
@@ -89,10 +92,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="where artifacts are kept (%(default)s)",
     )
-    job = _job_options()
+    job = job_options()
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     for name, parents, purpose in (
         ("run", [job, shared], "make the asset; finished stages are taken from the store"),
+        ("relight", [relight_options(), shared], "show views or an asset under another light"),
         ("plan", [job, shared], "say which stages a run would compute, and why"),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
@@ -101,57 +105,6 @@ def _parser() -> argparse.ArgumentParser:
             name, parents=parents, help=purpose, description=purpose[0].upper() + purpose[1:] + "."
         )
     return parser
-
-
-def _job_options() -> argparse.ArgumentParser:
-    """Options that say what to make, shared by `run` and `plan`."""
-    job = argparse.ArgumentParser(add_help=False, epilog=f"Stages: {STAGES}.")
-    job.add_argument(
-        "input",
-        nargs="?",
-        default="example",
-        metavar="INPUT",
-        help="an orbit folder, a .glb, .gltf or .obj file, a scene file (.json), or the word "
-        "'example' (the default)",
-    )
-    job.add_argument(
-        "-o", "--output", type=Path, metavar="OUT", help="run folder (out/<name of the input>)"
-    )
-    job.add_argument(
-        "--preset", default="standard", help="preview, standard or paper (%(default)s)"
-    )
-    job.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="STAGE.NAME=VALUE",
-        help="change one setting; may be repeated",
-    )
-    for option, target, purpose in (
-        ("--from", "start", "recompute this stage and all after it"),
-        ("--until", "until", "stop after this stage"),
-        ("--only", "only", "this stage alone; what it needs must be in the store"),
-    ):
-        job.add_argument(option, dest=target, metavar="STAGE", help=purpose)
-    job.add_argument(
-        "--skip",
-        action="append",
-        default=[],
-        metavar="STAGE",
-        help=f"leave a stage out ({', '.join(IMAGE_TO_ASSET.skippable)}); may be repeated",
-    )
-    job.add_argument(
-        "--force",
-        action="append",
-        default=[],
-        metavar="STAGE",
-        help="recompute a stage though nothing changed; may be repeated",
-    )
-    job.add_argument("--seed", type=int, default=0, help="of all random numbers (%(default)s)")
-    job.add_argument(
-        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="(%(default)s)"
-    )
-    return job
 
 
 class _Version(argparse.Action):

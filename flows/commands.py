@@ -18,6 +18,13 @@ EXAMPLE = "example"
 OUTPUT_ROOT = Path("out")
 
 
+def input_path(given: str) -> Path:
+    """Where an input lies; the word `example` stands for the scene that comes with the program."""
+    if given != EXAMPLE:
+        return Path(given)
+    return Path(str(importlib.resources.files("configs") / "example.json"))
+
+
 @dataclass(frozen=True)
 class Request:
     """What the user asked for, as given on the command line; see `svim3d run --help`."""
@@ -38,9 +45,7 @@ class Request:
     @property
     def path(self) -> Path:
         """Where the input lies."""
-        if self.source != EXAMPLE:
-            return Path(self.source)
-        return Path(str(importlib.resources.files("configs") / "example.json"))
+        return input_path(self.source)
 
     @property
     def run_folder(self) -> Path:

@@ -36,6 +36,8 @@ NUMERIC_LIBRARIES = (
 SKIPPED_INPUT = "none"
 # Meshes that name further files beside them, which belong to the input as much as they do.
 REFERRING_SUFFIXES = frozenset({".obj", ".mtl", ".gltf"})
+# A frame has its camera in the index of its orbit, beside it or one folder up.
+FRAME_SUFFIX, ORBIT_INDEX = ".exr", "orbit.json"
 
 
 def digest_json(value: Any) -> str:
@@ -119,6 +121,8 @@ def _digests_with_referred(file: Path) -> list[str]:
         named = [n for n in neighbours if n not in seen and _is_named(n.name, text)]
         seen.update(named)
         queue.extend(named)
+    if file.suffix.lower() == FRAME_SUFFIX:
+        seen.update(i for p in file.resolve().parents[:2] if (i := p / ORBIT_INDEX).is_file())
     return [digest_file(file), *(digest_file(f) for f in sorted(seen - {file}))]
 
 

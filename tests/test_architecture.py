@@ -33,6 +33,7 @@ CONTRACT = (
     "stages.artifacts",
     "stages.errors",
     "stages.prefilter_cache",
+    "stages.subject",
     "stages.settings",
 )
 MAY_IMPORT = {

@@ -16,7 +16,7 @@ class RelightConfig(FileReadingConfig):
     environment: Path | None = None
     """Light: .exr, .hdr or an 8-bit picture; None is the built-in studio."""
 
-    layout: Literal["auto", "latlong", "octahedral", "cross"] = "auto"
+    layout: Literal["auto", "latlong", "octahedral", "cube cross"] = "auto"
     """How the light's picture maps to directions; auto goes by its sides."""
 
     azimuths_deg: Annotated[tuple[FiniteFloat, ...], Field(min_length=1, max_length=MAX_FRAMES)] = (
@@ -49,11 +49,11 @@ class RelightConfig(FileReadingConfig):
     engine: Literal["raster", "path"] = "raster"
     """What renders a finished asset: our rasteriser, or Mitsuba's path tracer."""
 
-    views: tuple[Annotated[int, Field(ge=0)], ...] | None = None
-    """Indices of the views to relight; None takes all of an orbit."""
+    views: tuple[Annotated[int, Field(ge=0)], ...] | Literal["all", "reference"] = "all"
+    """Which views to relight, by index."""
 
     turntable: Literal["gif", "mp4", "png", "none"] = "gif"
-    """How the turns of the light are shown, on the reference view (or the first of `views`)."""
+    """How the turns of the light are shown, on the reference view or else the first one."""
 
     frames_per_s: Annotated[int, Field(ge=1, le=120)] = 20
     """Speed of the turntable."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -111,9 +111,9 @@ def _texture(mi: Mitsuba, values: Tensor) -> dict[str, Any]:
 
 def _faces_of(mesh: SourceMesh, material: int, mirrored: bool) -> Int[Tensor, "F 3"]:
     """Faces of a material whose texture is shown as it is, or as in a mirror."""
-    chosen: Bool[Tensor, "F"] = mesh.face_material == material
     handedness = mesh.tangents[mesh.faces[:, 0].long(), 3]
-    return mesh.faces[chosen & ((handedness < 0.0) == mirrored)].long()
+    chosen = (mesh.face_material == material) & ((handedness < 0.0) == mirrored)
+    return mesh.faces[chosen].long()
 
 
 def _shape(

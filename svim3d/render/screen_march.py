@@ -136,7 +136,7 @@ def _march(
                 if not offset < span:
                     break
                 share = offset / span
-                i, j = int(math.floor(row + share * down)), int(math.floor(column + share * across))
+                i, j = math.floor(row + share * down), math.floor(column + share * across)
                 if i < 0 or j < 0 or i >= height or j >= width:
                     break
                 # Of all things along the ray, 1/z is what grows evenly on the picture.

@@ -144,3 +144,14 @@ def test_absent_input_is_refused(tmp_path):
         InputError, match="does not exist; give an orbit folder, a mesh or a scene file"
     ):
         digest_input(tmp_path / "nowhere")
+
+
+def test_frame_has_another_digest_when_its_camera_moves(tmp_path):
+    (tmp_path / "train").mkdir()
+    frame = tmp_path / "train" / "000.exr"
+    frame.write_bytes(b"pixels")
+    alone = digest_input(frame)
+    (tmp_path / "orbit.json").write_text("{}")
+    listed = digest_input(frame)
+    (tmp_path / "orbit.json").write_text('{"fov": 2}')
+    assert len({alone, listed, digest_input(frame)}) == 3

@@ -1,0 +1,139 @@
+"""The options of each command."""
+
+import argparse
+from pathlib import Path
+
+from flows.pipeline import IMAGE_TO_ASSET
+
+STAGES = ", ".join(IMAGE_TO_ASSET.names)
+
+
+def job_options() -> argparse.ArgumentParser:
+    """Options that say what to make, shared by `run` and `plan`."""
+    job = argparse.ArgumentParser(add_help=False, epilog=f"Stages: {STAGES}.")
+    job.add_argument(
+        "input",
+        nargs="?",
+        default="example",
+        metavar="INPUT",
+        help="an orbit folder, a .glb, .gltf or .obj file, a scene file (.json), or the word "
+        "'example' (the default)",
+    )
+    job.add_argument(
+        "-o", "--output", type=Path, metavar="OUT", help="run folder (out/<name of the input>)"
+    )
+    job.add_argument(
+        "--preset", default="standard", help="preview, standard or paper (%(default)s)"
+    )
+    job.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="STAGE.NAME=VALUE",
+        help="change one setting; may be repeated",
+    )
+    for option, target, purpose in (
+        ("--from", "start", "recompute this stage and all after it"),
+        ("--until", "until", "stop after this stage"),
+        ("--only", "only", "this stage alone; what it needs must be in the store"),
+    ):
+        job.add_argument(option, dest=target, metavar="STAGE", help=purpose)
+    job.add_argument(
+        "--skip",
+        action="append",
+        default=[],
+        metavar="STAGE",
+        help=f"leave a stage out ({', '.join(IMAGE_TO_ASSET.skippable)}); may be repeated",
+    )
+    job.add_argument(
+        "--force",
+        action="append",
+        default=[],
+        metavar="STAGE",
+        help="recompute a stage though nothing changed; may be repeated",
+    )
+    _add_machine(job)
+    return job
+
+
+def relight_options() -> argparse.ArgumentParser:
+    """Options of `relight`."""
+    options = argparse.ArgumentParser(add_help=False)
+    options.add_argument(
+        "input",
+        metavar="INPUT",
+        help="an orbit folder, one frame of it (.exr), a .glb, .gltf or .obj asset, a run folder, "
+        "or the word 'example'",
+    )
+    options.add_argument(
+        "-o", "--output", type=Path, metavar="OUT", help="folder (out/<input>-in-<light>)"
+    )
+    _add_light_and_paint(options)
+    _add_rendering(options)
+    _add_machine(options)
+    options.add_argument("--force", action="store_true", help="compute again though it is there")
+    return options
+
+
+def _add_light_and_paint(options: argparse.ArgumentParser) -> None:
+    light = options.add_argument_group("light")
+    light.add_argument(
+        "--env", type=Path, metavar="FILE", help=".exr, .hdr or a picture (built-in studio)"
+    )
+    light.add_argument(
+        "--layout",
+        choices=("auto", "latlong", "octahedral", "cross"),
+        help="how the picture shows directions (auto: by its sides)",
+    )
+    light.add_argument(
+        "--rotate",
+        default="0",
+        metavar="DEG",
+        help="turn the light counter-clockwise seen from above: degrees, or START:STOP:STEP for a "
+        "turntable; write negative ones as --rotate=-90 (0)",
+    )
+    light.add_argument(
+        "--exposure", type=float, metavar="STOPS", help="brighten pictures, not EXR files (0)"
+    )
+    paint = options.add_argument_group("materials")
+    paint.add_argument(
+        "--edit",
+        action="append",
+        default=[],
+        metavar="EDIT",
+        help="like 'roughness*0.5', 'basecolor=#aa3311' or 'metallic=1'; may be repeated",
+    )
+    paint.add_argument("--mask", type=Path, metavar="FILE", help="picture of the region to edit")
+
+
+def _add_rendering(options: argparse.ArgumentParser) -> None:
+    how = options.add_argument_group("rendering")
+    how.add_argument("--quality", choices=("fast", "exact"), help="split sum, or sampling (fast)")
+    how.add_argument("--samples", type=int, metavar="N", help="per pixel, where sampled (256)")
+    how.add_argument("--occlusion", choices=("on", "off"), default="on", help="(%(default)s)")
+    how.add_argument(
+        "--multiple-scattering", choices=("on", "off"), default="on", help="(%(default)s)"
+    )
+    how.add_argument(
+        "--engine", choices=("raster", "path"), help="for assets; path needs svim3d[path] (raster)"
+    )
+    views = options.add_argument_group("views")
+    views.add_argument(
+        "--views", default="all", metavar="WHICH", help="all, reference, or indices like 0,5 (all)"
+    )
+    views.add_argument(
+        "--turntable", choices=("gif", "mp4", "png", "none"), help="mp4 needs ffmpeg (gif)"
+    )
+    views.add_argument("--fps", type=int, metavar="N", help="frames per second (20)")
+    views.add_argument("--size", type=int, metavar="PX", help="of an asset's views (512)")
+    views.add_argument("--orbit-views", type=int, metavar="N", help="around an asset (8)")
+    views.add_argument("--elevation", type=float, metavar="DEG", help="of those cameras (10)")
+    views.add_argument("--fov", type=float, metavar="DEG", help="vertical, of those cameras (33.8)")
+
+
+def _add_machine(parser: argparse.ArgumentParser) -> None:
+    """What decides how numbers come about, shared by all commands that compute."""
+    parser.add_argument("--seed", type=int, default=0, help="of all random numbers (%(default)s)")
+    parser.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="(%(default)s)"
+    )
