@@ -8,12 +8,14 @@ microfacet model for real-time image-based lighting".
 """
 
 import functools
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from svim3d.numerics import dot, reflect
+from svim3d.shading.dominant_lobe import bend_table
 from svim3d.shading.microfacet import (
     alpha_from_roughness,
     sample_visible_normal,
@@ -21,6 +23,9 @@ from svim3d.shading.microfacet import (
     smith_lambda,
 )
 
+# Light that bounces between microfacets: lost, returned as a broad lobe (Fdez-Aguera), or returned
+# in the shape of the first bounce ("scaled", Turquin).
+MultipleScattering = bool | Literal["scaled"]
 TABLE_SIZE = 64  # entries per side
 AZIMUTHS, ELEVATIONS = 20, 40  # quadrature points of one entry: error below 1e-3
 MIN_N_DOT_V = 1e-3  # a normal that faces away is shaded as if seen at grazing incidence
@@ -28,8 +33,8 @@ SCHLICK_MEAN_WEIGHT = 1.0 / 21.0  # cosine-weighted mean of (1 - cos)^5
 
 
 @functools.lru_cache(maxsize=8)
-def split_sum_table(device: torch.device, dtype: torch.dtype) -> Float[Tensor, "r v 2"]:
-    """The (A, B) table: rows roughness, columns sqrt(n.v), from 0 to 1, both ends included.
+def split_sum_table(device: torch.device, dtype: torch.dtype) -> Float[Tensor, "r v 3"]:
+    """The table of A, B and the lobe's bend: rows roughness, columns sqrt(n.v), from 0 to 1, both ends included.
 
     The square root gives grazing angles, where smooth materials change fast, their resolution.
     """
@@ -38,7 +43,8 @@ def split_sum_table(device: torch.device, dtype: torch.dtype) -> Float[Tensor, "
         torch.cat(integrate_split_sum(axis * axis, roughness.expand_as(axis)), -1)
         for roughness in axis
     ]
-    return torch.stack(rows).to(device, dtype)
+    bend = bend_table(TABLE_SIZE)[..., None]
+    return torch.cat([torch.stack(rows), bend], -1).to(device, dtype)
 
 
 def integrate_split_sum(
@@ -71,8 +77,16 @@ def integrate_split_sum(
 def lookup_split_sum(
     n_dot_v: Float[Tensor, "P 1"], roughness: Float[Tensor, "P 1"]
 ) -> tuple[Float[Tensor, "P 1"], Float[Tensor, "P 1"]]:
-    """Bilinear (A, B) from the table; differentiable in both arguments."""
-    table = split_sum_table(n_dot_v.device, n_dot_v.dtype).view(-1, 2)
+    """A and B from the table."""
+    scale, bias, _ = lookup_table(n_dot_v, roughness).split(1, -1)
+    return scale, bias
+
+
+def lookup_table(
+    n_dot_v: Float[Tensor, "P 1"], roughness: Float[Tensor, "P 1"]
+) -> Float[Tensor, "P 3"]:
+    """Bilinear (A, B, bend) from the table; differentiable in both arguments."""
+    table = split_sum_table(n_dot_v.device, n_dot_v.dtype).view(-1, 3)
     x = n_dot_v.clamp(MIN_N_DOT_V, 1.0).sqrt() * (TABLE_SIZE - 1)
     y = roughness.clamp(0.0, 1.0) * (TABLE_SIZE - 1)
     x0 = x.detach().floor().clamp_max(TABLE_SIZE - 2)
@@ -82,8 +96,7 @@ def lookup_split_sum(
     low = table[corner] + fx * (table[corner + 1] - table[corner])
     above = corner + TABLE_SIZE
     high = table[above] + fx * (table[above + 1] - table[above])
-    scale_bias = low + fy * (high - low)
-    return scale_bias[:, :1], scale_bias[:, 1:]
+    return low + fy * (high - low)
 
 
 def lobe_albedos(
@@ -91,19 +104,22 @@ def lobe_albedos(
     n_dot_v: Float[Tensor, "P 1"],
     roughness: Float[Tensor, "P 1"],
     *,
-    multiple_scattering: bool,
+    multiple_scattering: MultipleScattering,
 ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
     """Directional albedos of the specular lobe: of one bounce, and of all further bounces.
 
-    With f0 = 1 and multiple scattering they sum to one: the white furnace.
+    With f0 = 1 and either kind of multiple scattering they sum to one: the white furnace.
 
-    Source: Fdez-Aguera 2019, eq. 13 to 19. Differs from the paper: F0 A + B takes plain F0; the
+    Source: Fdez-Aguera 2019, eq. 13 to 19; "scaled": Turquin 2019, "Practical multiple scattering
+    compensation for microfacet models", eq. 16, its F the material's F0. The first differs from the paper: F0 A + B takes plain F0; the
     listing's roughness-dependent Fresnel term counts the grazing reflection twice.
     """
     scale, bias = lookup_split_sum(n_dot_v, roughness)
     single = f0 * scale + bias
+    escaped = 1.0 - (scale + bias)
+    if multiple_scattering == "scaled":
+        return single * (1.0 + f0 * escaped / (scale + bias)), torch.zeros_like(single)
     if not multiple_scattering:
         return single, torch.zeros_like(single)
-    escaped = 1.0 - (scale + bias)
     mean_fresnel = f0 + (1.0 - f0) * SCHLICK_MEAN_WEIGHT
     return single, escaped * single * mean_fresnel / (1.0 - mean_fresnel * escaped)

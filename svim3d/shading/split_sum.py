@@ -13,7 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from svim3d.numerics import dot
-from svim3d.shading.directional_albedo import MIN_N_DOT_V, lobe_albedos
+from svim3d.shading.directional_albedo import (
+    MIN_N_DOT_V,
+    MultipleScattering,
+    lobe_albedos,
+    lookup_table,
+)
+from svim3d.shading.dominant_lobe import dominant_direction
 from svim3d.shading.metallic_roughness import diffuse_albedo, specular_f0
 from svim3d.shading.prefilter import EnvironmentPyramid
 from svim3d.shading.split_sum_cpu import fused_shade
@@ -45,7 +51,7 @@ def shade(
     metallic: Float[Tensor, "P 1"],
     pyramid: EnvironmentPyramid,
     *,
-    multiple_scattering: bool = True,
+    multiple_scattering: MultipleScattering = True,
 ) -> Shading:
     """Radiance that leaves P points towards `wo`; differentiable in everything.
 
@@ -56,7 +62,8 @@ def shade(
         roughness: perceptual, in [0, 1].
         metallic: in [0, 1].
         pyramid: the prefiltered environment, in the same frame.
-        multiple_scattering: return the light that bounces between microfacets as well.
+        multiple_scattering: return the light that bounces between microfacets as well: True as a
+            broad lobe, "scaled" in the shape of the first bounce.
     """
     if normal.device.type == "cpu":
         return Shading(
@@ -89,7 +96,7 @@ def shade_plainly(
     metallic: Float[Tensor, "P 1"],
     pyramid: EnvironmentPyramid,
     *,
-    multiple_scattering: bool,
+    multiple_scattering: MultipleScattering,
 ) -> Shading:
     """`shade` in plain tensor operations, for any device: the twin of the compiled kernel."""
     n_dot_v = dot(normal, wo)
@@ -100,25 +107,9 @@ def shade_plainly(
         roughness,
         multiple_scattering=multiple_scattering,
     )
-    direction = dominant_direction(normal, wo, n_dot_v, roughness)
+    direction = dominant_direction(normal, wo, n_dot_v, lookup_table(visible, roughness)[:, 2:])
     irradiance = pyramid.irradiance(normal)
     specular = single * pyramid.specular(direction, roughness) + multiple * irradiance
     # What the specular layer does not reflect reaches the diffuse base.
     transmitted = 1.0 - single - multiple
     return Shading(diffuse_albedo(basecolor, metallic) * transmitted * irradiance, specular)
-
-
-def dominant_direction(
-    normal: Float[Tensor, "P 3"],
-    wo: Float[Tensor, "P 3"],
-    n_dot_v: Float[Tensor, "P 1"],
-    roughness: Float[Tensor, "P 1"],
-) -> Float[Tensor, "P 3"]:
-    """Direction about which the prefiltered lobe best stands for the true one; not unit.
-
-    A rough lobe leans from the mirror direction towards the normal. The share roughness^3 is within
-    0.1 of the best one for every n.v at F0 = 1 over eight HDR environments; at roughness 1 it cuts
-    the error of an unbent lookup from 0.24 to 0.07 (n.v = 0.9) and from 0.51 to 0.09 (n.v = 0.5).
-    """
-    mirror = 2.0 * n_dot_v * normal - wo
-    return mirror + roughness**3 * (normal - mirror)

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from svim3d.shading.directional_albedo import split_sum_table
+from svim3d.shading.directional_albedo import MultipleScattering, split_sum_table
 from svim3d.shading.prefilter import EnvironmentPyramid
-from svim3d.shading.split_sum_kernel import shade_backward, shade_forward
+from svim3d.shading.split_sum_kernel import BROAD, OFF, SCALED, shade_backward, shade_forward
 
 POINTS_PER_CHUNK = 4096  # large enough to repay one copy of the pyramid's gradient
 MAX_CHUNKS = 32  # bounds the memory of those copies
@@ -29,7 +29,7 @@ def fused_shade(
     metallic: Float[Tensor, "P 1"],
     pyramid: EnvironmentPyramid,
     *,
-    multiple_scattering: bool,
+    multiple_scattering: MultipleScattering,
 ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
     """Diffuse and specular radiance; differentiable in everything, arguments as in `shade`."""
     layout = pyramid.layout
@@ -38,7 +38,8 @@ def fused_shade(
         np.array((*layout.sizes, layout.irradiance_size)),
         np.array(layout.offsets),
     )
-    settings = (split_sum_table(normal.device, normal.dtype).numpy(), multiple_scattering)
+    bounces = SCALED if multiple_scattering == "scaled" else BROAD if multiple_scattering else OFF
+    settings = (split_sum_table(normal.device, normal.dtype).numpy(), bounces)
     points = (normal, wo, basecolor, roughness, metallic, pyramid.texels)
     shaded: tuple[Tensor, Tensor] = _Shade.apply(levels, settings, *points)  # type: ignore[no-untyped-call]
     return shaded
@@ -49,7 +50,7 @@ class _Shade(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, levels: tuple[Any, ...], settings: tuple[Any, bool], *inputs: Tensor
+        ctx: Any, levels: tuple[Any, ...], settings: tuple[Any, int], *inputs: Tensor
     ) -> tuple[Tensor, Tensor]:
         contiguous = [t.detach().contiguous() for t in inputs]
         ctx.levels, ctx.settings = levels, settings
@@ -63,7 +64,7 @@ class _Shade(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         *points, texels = ctx.saved_tensors
-        table, multiple_scattering = ctx.settings
+        table, bounces = ctx.settings
         gradients = [torch.empty_like(t) for t in points]
         # Without a wanted gradient the copies are empty, which the kernel understands.
         chunks = _chunk_count(len(points[0]))
@@ -72,7 +73,7 @@ class _Shade(torch.autograd.Function):
             _arrays(points),
             (texels.numpy(), *ctx.levels),
             table,
-            multiple_scattering,
+            bounces,
             _arrays([g.contiguous() for g in upstream]),
             _arrays(gradients),
             copies.numpy(),

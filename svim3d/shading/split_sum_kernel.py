@@ -16,6 +16,7 @@ from svim3d.shading.directional_albedo import MIN_N_DOT_V, SCHLICK_MEAN_WEIGHT, 
 from svim3d.shading.metallic_roughness import DIELECTRIC_F0
 from svim3d.shading.octahedral import MIN_L1_NORM
 
+OFF, BROAD, SCALED = 0, 1, 2  # what becomes of light that bounces between microfacets
 Array = NDArray[Any]
 Points = tuple[Array, Array, Array, Array, Array]  # normal, view, base colour, roughness, metallic
 Pyramid = tuple[Array, Array, Array, Array]  # texels, roughness knots, sizes and offsets of levels
@@ -28,7 +29,7 @@ def shade_forward(
     points: Points,
     pyramid: Pyramid,
     table: Array,
-    multiple_scattering: bool,
+    bounces: int,
     shaded: tuple[Array, Array],
 ) -> None:
     """Write diffuse and specular radiance; one point per iteration."""
@@ -38,8 +39,9 @@ def shade_forward(
     last = len(knots)
     for p in numba.prange(len(normal)):
         r, m = float(roughness[p, 0]), float(metallic[p, 0])
-        _, n_dot_v, dx, dy, dz = _directions(normal[p], wo[p], r)
-        scale, bias, _, _, _, _ = _table_lookup(table, n_dot_v, r)
+        raw = _dot(normal[p], wo[p])
+        (scale, bias, bend), _, _ = _table_lookup(table, min(max(raw, MIN_N_DOT_V), 1.0), r)
+        dx, dy, dz = _direction(normal[p], wo[p], raw, bend)
         level, fraction, _ = _level(knots, r)
         sharp = _locate(dx, dy, dz, sizes[level])
         blurred = _locate(dx, dy, dz, sizes[level + 1])
@@ -51,7 +53,9 @@ def shade_forward(
             radiance = low + fraction * (high - low)
             f0 = DIELECTRIC_F0 * (1.0 - m) + basecolor[p, c] * m
             single = f0 * scale + bias
-            multiple = _bounces(f0, single, scale + bias) if multiple_scattering else 0.0
+            multiple = _further(f0, single, scale + bias) if bounces == BROAD else 0.0
+            if bounces == SCALED:
+                single *= 1.0 + f0 * (1.0 - scale - bias) / (scale + bias)
             albedo = basecolor[p, c] * (1.0 - m)
             diffuse[p, c] = albedo * (1.0 - single - multiple) * irradiance
             specular[p, c] = single * radiance + multiple * irradiance
@@ -62,7 +66,7 @@ def shade_backward(
     points: Points,
     pyramid: Pyramid,
     table: Array,
-    multiple_scattering: bool,
+    bounces: int,
     upstream: tuple[Array, Array],
     gradients: Points,
     grad_texels: Array,
@@ -76,8 +80,10 @@ def shade_backward(
     for chunk in numba.prange(chunks):
         for p in range(chunk * count // chunks, (chunk + 1) * count // chunks):
             r, m = float(roughness[p, 0]), float(metallic[p, 0])
-            raw, n_dot_v, dx, dy, dz = _directions(normal[p], wo[p], r)
-            scale, bias, scale_v, bias_v, scale_r, bias_r = _table_lookup(table, n_dot_v, r)
+            raw = _dot(normal[p], wo[p])
+            n_dot_v = min(max(raw, MIN_N_DOT_V), 1.0)
+            (scale, bias, bend), along_v, along_r = _table_lookup(table, n_dot_v, r)
+            dx, dy, dz = _direction(normal[p], wo[p], raw, bend)
             level, fraction, slope = _level(knots, r)
             sharp = _locate(dx, dy, dz, sizes[level])
             blurred = _locate(dx, dy, dz, sizes[level + 1])
@@ -95,7 +101,7 @@ def shade_backward(
                 light = (low + fraction * (high - low), irradiance, fraction)
                 g_shaded = (grad_diffuse[p, c], grad_specular[p, c])
                 g_low, g_high, g_irradiance, g_base, g_metal, g_a, g_b = _channel_adjoint(
-                    basecolor[p, c], m, (scale, bias), multiple_scattering, light, g_shaded
+                    basecolor[p, c], m, (scale, bias), bounces, light, g_shaded
                 )
                 grad_basecolor[p, c] = g_base
                 g_m, g_scale, g_bias = g_m + g_metal, g_scale + g_a, g_bias + g_b
@@ -108,20 +114,20 @@ def shade_backward(
                     _scatter(grad_texels[chunk], offsets[level], sharp, c, g_low)
                     _scatter(grad_texels[chunk], offsets[level + 1], blurred, c, g_high)
                     _scatter(grad_texels[chunk], offsets[last], around, c, g_irradiance)
-            g_dot = g_scale * scale_v + g_bias * bias_v if MIN_N_DOT_V <= raw <= 1.0 else 0.0
             g_direction = _square_adjoint(dx, dy, dz, g_u, g_v)
             nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
             g_around = _square_adjoint(nx, ny, nz, g_around_u, g_around_v)
-            g_bend = _direction_adjoint(
-                normal[p], wo[p], raw, r, g_direction, g_around, g_dot, grad_normal[p], grad_wo[p]
-            )
-            g_r = g_scale * scale_r + g_bias * bias_r + g_fraction * slope
-            grad_roughness[p, 0] = g_r + g_bend * 3.0 * r * r
+            g_bend = _bend_adjoint(normal[p], wo[p], raw, g_direction)
+            g_table = (g_scale, g_bias, g_bend)
+            g_dot = _inner(g_table, along_v) if MIN_N_DOT_V <= raw <= 1.0 else 0.0
+            grad_roughness[p, 0] = _inner(g_table, along_r) + g_fraction * slope
+            grads = (grad_normal[p], grad_wo[p])
+            _direction_adjoint(normal[p], wo[p], raw, bend, g_direction, g_around, g_dot, grads)
             grad_metallic[p, 0] = g_m
 
 
 @kernel()
-def _bounces(f0: float, single: float, evenly_lit: float) -> float:
+def _further(f0: float, single: float, evenly_lit: float) -> float:
     """Albedo of all bounces after the first; see `directional_albedo.lobe_albedos`."""
     escaped = 1.0 - evenly_lit
     mean = f0 + (1.0 - f0) * SCHLICK_MEAN_WEIGHT
@@ -133,7 +139,7 @@ def _channel_adjoint(
     base: float,
     m: float,
     table: tuple[float, float],
-    multiple_scattering: bool,
+    bounces: int,
     light: Triple,
     g_shaded: tuple[float, float],
 ) -> tuple[float, float, float, float, float, float, float]:
@@ -145,12 +151,15 @@ def _channel_adjoint(
     radiance, irradiance, fraction = light
     g_diffuse, g_specular = g_shaded
     f0, albedo = DIELECTRIC_F0 * (1.0 - m) + base * m, base * (1.0 - m)
-    single, multiple, gain = f0 * scale + bias, 0.0, 0.0
+    first, multiple, gain, stretch = f0 * scale + bias, 0.0, 0.0, 1.0
     escaped = 1.0 - (scale + bias)
+    lost = escaped / (scale + bias) if bounces == SCALED else 0.0
     mean = f0 + (1.0 - f0) * SCHLICK_MEAN_WEIGHT
-    if multiple_scattering:
+    if bounces == BROAD:
         gain = 1.0 / (1.0 - mean * escaped)
-        multiple = escaped * single * mean * gain
+        multiple = escaped * first * mean * gain
+    stretch += f0 * lost
+    single = first * stretch
     transmitted = 1.0 - single - multiple
     # Through the products to radiance, irradiance and the three shares.
     g_radiance = g_specular * single
@@ -159,19 +168,32 @@ def _channel_adjoint(
     g_multiple = (g_specular - g_diffuse * albedo) * irradiance
     g_single = g_specular * radiance - g_diffuse * albedo * irradiance
     # Through the geometric series of bounces; `gain` is zero without them.
-    g_single += g_multiple * escaped * mean * gain
-    g_escaped = g_multiple * single * mean * gain * gain
-    g_mean = g_multiple * single * escaped * gain * gain
-    g_f0 = g_single * scale + g_mean * (1.0 - SCHLICK_MEAN_WEIGHT)
+    g_first = g_single * stretch + g_multiple * escaped * mean * gain
+    g_escaped = g_multiple * first * mean * gain * gain
+    g_mean = g_multiple * first * escaped * gain * gain
+    g_f0 = g_first * scale + g_mean * (1.0 - SCHLICK_MEAN_WEIGHT)
+    # Through the scale of the first bounce: lost = (1 - E) / E, so d lost / d escaped = 1 / E^2.
+    g_f0 += g_single * first * lost
+    if bounces == SCALED:
+        g_escaped += g_single * first * f0 / ((scale + bias) * (scale + bias))
     return (
         g_radiance * (1.0 - fraction),
         g_radiance * fraction,
         g_irradiance,
         g_f0 * m + g_albedo * (1.0 - m),
         g_f0 * (base - DIELECTRIC_F0) - g_albedo * base,
-        g_single * f0 - g_escaped,
-        g_single - g_escaped,
+        g_first * f0 - g_escaped,
+        g_first - g_escaped,
     )
+
+
+@kernel()
+def _bend_adjoint(normal: Array, wo: Array, raw: float, g_direction: Triple) -> float:
+    """Derivative by the bend: direction = mirror + bend (normal - mirror)."""
+    g_bend = 0.0
+    for k in range(3):
+        g_bend += g_direction[k] * (normal[k] - (2.0 * raw * normal[k] - wo[k]))
+    return g_bend
 
 
 @kernel()
@@ -179,39 +201,29 @@ def _direction_adjoint(
     normal: Array,
     wo: Array,
     raw: float,
-    r: float,
+    bend: float,
     g_direction: Triple,
     g_around: Triple,
     g_dot: float,
-    grad_normal: Array,
-    grad_wo: Array,
-) -> float:
-    """Write the derivatives by normal and view; return the one by the bend, r^3.
-
-    direction = mirror + r^3 (normal - mirror), mirror = 2 (n.v) n - v.
-    """
-    bend, g_bend = r * r * r, 0.0
+    grads: tuple[Array, Array],
+) -> None:
+    """Write the derivatives by normal and view; mirror = 2 (n.v) n - v. `g_dot` is by n.v."""
+    grad_normal, grad_wo = grads
     for k in range(3):
-        mirror = 2.0 * raw * normal[k] - wo[k]
-        g_bend += g_direction[k] * (normal[k] - mirror)
         g_dot += 2.0 * (1.0 - bend) * g_direction[k] * normal[k]
     for k in range(3):
         g_mirror = (1.0 - bend) * g_direction[k]
         g_straight = bend * g_direction[k] + 2.0 * raw * g_mirror
         grad_normal[k] = g_straight + g_around[k] + g_dot * wo[k]
         grad_wo[k] = g_dot * normal[k] - g_mirror
-    return g_bend
 
 
 @kernel()
-def _directions(normal: Array, wo: Array, r: float) -> tuple[float, float, float, float, float]:
-    """n.v as it is and within its bounds, and the dominant direction (not unit)."""
-    raw = float(normal[0]) * wo[0] + float(normal[1]) * wo[1] + float(normal[2]) * wo[2]
-    straight = 2.0 * raw * (1.0 - r * r * r) + r * r * r
-    against = 1.0 - r * r * r
+def _direction(normal: Array, wo: Array, raw: float, bend: float) -> Triple:
+    """The dominant direction, not unit; see `dominant_lobe.dominant_direction`."""
+    against = 1.0 - bend
+    straight = 2.0 * raw * against + bend
     return (
-        raw,
-        min(max(raw, MIN_N_DOT_V), 1.0),
         straight * normal[0] - against * wo[0],
         straight * normal[1] - against * wo[1],
         straight * normal[2] - against * wo[2],
@@ -219,32 +231,45 @@ def _directions(normal: Array, wo: Array, r: float) -> tuple[float, float, float
 
 
 @kernel()
-def _table_lookup(
-    table: Array, n_dot_v: float, r: float
-) -> tuple[float, float, float, float, float, float]:
-    """A, B, and their derivatives by n.v and by roughness."""
+def _dot(a: Array, b: Array) -> float:
+    """Inner product in double precision."""
+    product: float = float(a[0]) * b[0] + float(a[1]) * b[1] + float(a[2]) * b[2]
+    return product
+
+
+@kernel()
+def _inner(a: Triple, b: Triple) -> float:
+    """Inner product of triples."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel()
+def _table_lookup(table: Array, n_dot_v: float, r: float) -> tuple[Triple, Triple, Triple]:
+    """(A, B, bend), and their derivatives by n.v and by roughness."""
     root, span = math.sqrt(n_dot_v), TABLE_SIZE - 1
     x, y = root * span, min(max(r, 0.0), 1.0) * span
     # Bounded from below too: a NaN must come out as NaN, not as a read outside the table.
     x0, y0 = max(0, min(int(x), TABLE_SIZE - 2)), max(0, min(int(y), TABLE_SIZE - 2))
-    fx, fy = x - x0, y - y0
-    along, within = span / (2.0 * root), float(span) if 0.0 <= r <= 1.0 else 0.0
-    low_a = table[y0, x0, 0] + fx * (table[y0, x0 + 1, 0] - table[y0, x0, 0])
-    low_b = table[y0, x0, 1] + fx * (table[y0, x0 + 1, 1] - table[y0, x0, 1])
-    high_a = table[y0 + 1, x0, 0] + fx * (table[y0 + 1, x0 + 1, 0] - table[y0 + 1, x0, 0])
-    high_b = table[y0 + 1, x0, 1] + fx * (table[y0 + 1, x0 + 1, 1] - table[y0 + 1, x0, 1])
-    slope_a = (1.0 - fy) * (table[y0, x0 + 1, 0] - table[y0, x0, 0])
-    slope_a += fy * (table[y0 + 1, x0 + 1, 0] - table[y0 + 1, x0, 0])
-    slope_b = (1.0 - fy) * (table[y0, x0 + 1, 1] - table[y0, x0, 1])
-    slope_b += fy * (table[y0 + 1, x0 + 1, 1] - table[y0 + 1, x0, 1])
+    at = (x0, y0, x - x0, y - y0)
+    per_x, per_y = span / (2.0 * root), float(span) if 0.0 <= r <= 1.0 else 0.0
+    a, a_v, a_r = _table_channel(table, at, 0)
+    b, b_v, b_r = _table_channel(table, at, 1)
+    bend, bend_v, bend_r = _table_channel(table, at, 2)
     return (
-        low_a + fy * (high_a - low_a),
-        low_b + fy * (high_b - low_b),
-        slope_a * along,
-        slope_b * along,
-        (high_a - low_a) * within,
-        (high_b - low_b) * within,
+        (a, b, bend),
+        (a_v * per_x, b_v * per_x, bend_v * per_x),
+        (a_r * per_y, b_r * per_y, bend_r * per_y),
     )
+
+
+@kernel()
+def _table_channel(table: Array, at: tuple[int, int, float, float], c: int) -> Triple:
+    """One bilinear value, and its derivatives per column and per row."""
+    x0, y0, fx, fy = at
+    below = table[y0, x0 + 1, c] - table[y0, x0, c]
+    above = table[y0 + 1, x0 + 1, c] - table[y0 + 1, x0, c]
+    low, high = table[y0, x0, c] + fx * below, table[y0 + 1, x0, c] + fx * above
+    return low + fy * (high - low), below + fy * (above - below), high - low
 
 
 @kernel()

@@ -14,12 +14,17 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from svim3d.numerics import dot
-from svim3d.shading.directional_albedo import MIN_N_DOT_V, lobe_albedos
+from svim3d.shading.directional_albedo import (
+    MIN_N_DOT_V,
+    MultipleScattering,
+    lobe_albedos,
+    lookup_table,
+)
+from svim3d.shading.dominant_lobe import dominant_direction
 from svim3d.shading.linear_operator import SparseOperator
 from svim3d.shading.metallic_roughness import diffuse_albedo, specular_f0
 from svim3d.shading.octahedral import bilinear_taps
 from svim3d.shading.prefilter import EnvironmentPyramid, PyramidLayout
-from svim3d.shading.split_sum import dominant_direction
 
 
 @dataclass(frozen=True)
@@ -46,18 +51,19 @@ class StoredShading:
         metallic: Float[Tensor, "P 1"],
         layout: PyramidLayout,
         *,
-        multiple_scattering: bool,
+        multiple_scattering: MultipleScattering,
     ) -> Self:
         """Collect taps and shares; arguments as in `split_sum.shade`."""
         n_dot_v = dot(normal, wo)
+        visible = n_dot_v.clamp(MIN_N_DOT_V, 1.0)
         single, multiple = lobe_albedos(
             specular_f0(basecolor, metallic),
-            n_dot_v.clamp(MIN_N_DOT_V, 1.0),
+            visible,
             roughness,
             multiple_scattering=multiple_scattering,
         )
         transmitted = diffuse_albedo(basecolor, metallic) * (1.0 - single - multiple)
-        direction = dominant_direction(normal, wo, n_dot_v, roughness)
+        direction = dominant_direction(normal, wo, n_dot_v, lookup_table(visible, roughness)[:, 2:])
         level, fraction = layout.locate(roughness)
         sizes = torch.tensor(layout.sizes, device=normal.device)
         starts = torch.tensor(layout.offsets, device=normal.device)

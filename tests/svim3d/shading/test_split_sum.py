@@ -36,7 +36,7 @@ def random_points(count: int, seed: int = 0, facing: float = 0.1) -> list[torch.
     return [normal, wo, *materials]
 
 
-@pytest.mark.parametrize("multiple_scattering", [True, False])
+@pytest.mark.parametrize("multiple_scattering", [True, False, "scaled"])
 def test_compiled_kernel_equals_its_plain_twin(multiple_scattering):
     points = random_points(500)
     points[0][:20] = -points[0][:20]  # some face away
@@ -141,7 +141,7 @@ def test_shading_is_linear_in_the_light():
     torch.testing.assert_close(both, parts)
 
 
-@pytest.mark.parametrize("multiple_scattering", [True, False])
+@pytest.mark.parametrize("multiple_scattering", [True, False, "scaled"])
 def test_stored_shading_equals_shading(multiple_scattering):
     operator, points = PyramidOperator.build(SIZE, "exact"), random_points(200)
     pyramid = operator(smooth_environment())
