@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
-from flows.options import job_options, relight_options
+from flows.options import edit_options, job_options, relight_options
 
 DONE, FAILED, BAD_INPUT, CANCELLED = 0, 1, 2, 130
 DEFAULT_STORE = Path(".svim3d")
@@ -57,6 +57,10 @@ def _dispatch(options: argparse.Namespace) -> int:
         from flows.relight import relight
 
         return relight(options)
+    if options.command == "edit":
+        from flows.edit import edit
+
+        return edit(options)
     from flows import commands
 
     if options.command == "presets":
@@ -97,6 +101,7 @@ def _parser() -> argparse.ArgumentParser:
     for name, parents, purpose in (
         ("run", [job, shared], "make the asset; finished stages are taken from the store"),
         ("relight", [relight_options(), shared], "show views or an asset under another light"),
+        ("edit", [edit_options(), shared], "write an asset with other materials"),
         ("plan", [job, shared], "say which stages a run would compute, and why"),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),

@@ -75,6 +75,36 @@ def relight_options() -> argparse.ArgumentParser:
     return options
 
 
+def edit_options() -> argparse.ArgumentParser:
+    """Options of `edit`."""
+    options = argparse.ArgumentParser(add_help=False)
+    options.add_argument("input", type=Path, metavar="ASSET", help="a .glb file")
+    options.add_argument(
+        "-o", "--output", type=Path, metavar="FILE", help="new .glb (ASSET-edited.glb beside it)"
+    )
+    _add_edit(options)
+    options.add_argument(
+        "--mask", type=Path, metavar="FILE", help="region in texture space; white is edited"
+    )
+    options.add_argument(
+        "--replay",
+        type=Path,
+        metavar="FILE",
+        help="edits.json that svim3d relight left beside views of this asset",
+    )
+    return options
+
+
+def _add_edit(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
+    parser.add_argument(
+        "--edit",
+        action="append",
+        default=[],
+        metavar="EDIT",
+        help="like 'roughness*0.5', 'basecolor=#aa3311' or 'metallic=1'; may be repeated",
+    )
+
+
 def _add_light_and_paint(options: argparse.ArgumentParser) -> None:
     light = options.add_argument_group("light")
     light.add_argument(
@@ -96,14 +126,13 @@ def _add_light_and_paint(options: argparse.ArgumentParser) -> None:
         "--exposure", type=float, metavar="STOPS", help="brighten pictures, not EXR files (0)"
     )
     paint = options.add_argument_group("materials")
+    _add_edit(paint)
     paint.add_argument(
-        "--edit",
-        action="append",
-        default=[],
-        metavar="EDIT",
-        help="like 'roughness*0.5', 'basecolor=#aa3311' or 'metallic=1'; may be repeated",
+        "--mask",
+        type=Path,
+        metavar="FILE",
+        help="region drawn on the reference view, white is edited; depth carries it to the others",
     )
-    paint.add_argument("--mask", type=Path, metavar="FILE", help="picture of the region to edit")
 
 
 def _add_rendering(options: argparse.ArgumentParser) -> None:

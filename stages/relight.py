@@ -12,6 +12,7 @@ shadows and lights itself.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import torch
 from jaxtyping import Float
@@ -24,13 +25,23 @@ from stages.prefilter_cache import cached_operator
 from stages.settings.relight import RelightConfig
 from stages.subject import MeshSubject, Subject, Viewpoint, read_subject
 from svim3d.io.animation import write_animation
+from svim3d.io.edit_record import EditRecord, read_region
 from svim3d.io.exr import write_layers
 from svim3d.io.image import contact_sheet, encode_png
 from svim3d.io.light import read_light
-from svim3d.render.image_shading import shade_view
+from svim3d.numerics import dot, normalize
+from svim3d.render.gbuffer import GBuffer
+from svim3d.render.image_shading import PointShader, shade_view
+from svim3d.render.regions import region_of_points, resized_region
 from svim3d.render.screen_visibility import ScreenVisibility
+from svim3d.shading.directional_albedo import MIN_N_DOT_V
 from svim3d.shading.environment import latlong_from_octahedral, rotate_about_y
+from svim3d.shading.material_edits import Edit, apply_edits
+from svim3d.shading.monte_carlo import shade_by_sampling
 from svim3d.shading.octahedral import texel_directions
+from svim3d.shading.prefilter import EnvironmentPyramid
+from svim3d.shading.sampled_light import SampledLight
+from svim3d.shading.split_sum import Shading, shade
 from svim3d.shading.studio import studio_radiance
 from svim3d.shading.tonemap import agx, expose
 
@@ -93,8 +104,9 @@ def _relight(source: Path, config: RelightConfig, ctx: Context) -> RelitViews:
     spun = subject.reference if subject.reference in chosen else chosen[0]
     turns = () if config.turntable == "none" else config.azimuths_deg
     light = _light(config, ctx)
-    lit = _lighting(subject, light, config, ctx)
-    files: dict[str, bytes] = {}
+    paint = _Paint.of(subject, spun, config, ctx)
+    lit = _lighting(subject, paint, light, config, ctx)
+    files = paint.record()
     shown: dict[str, Tensor] = {}
     for done, index in enumerate(chosen):
         picture = lit(index)(config.azimuths_deg[0])
@@ -152,16 +164,80 @@ def _light(config: RelightConfig, ctx: Context) -> Float[Tensor, "N N 3"]:
     return read_light(config.environment, ctx.event, layout=config.layout).octahedral()
 
 
+@dataclass(frozen=True)
+class _Paint:
+    """What is changed about the materials, and where.
+
+    Attributes:
+        edits: in order.
+        home: the view that the region was drawn on; None where there is no region.
+        region: at the size of `home`.
+        tell: told of clamped and implausible values.
+    """
+
+    edits: tuple[Edit, ...]
+    home: GBuffer | None
+    region: Float[Tensor, "H W 1"] | None
+    tell: Callable[[str, str], None]
+
+    @classmethod
+    def of(cls, subject: Subject, drawn_on: int, config: RelightConfig, ctx: Context) -> Self:
+        """Read the edits; a region is taken to be drawn on the view `drawn_on`."""
+        edits = tuple(Edit.parse(text) for text in config.edits)
+        if config.mask is None:
+            return cls(edits, None, None, ctx.event)
+        home = subject.view(drawn_on)
+        region = resized_region(read_region(config.mask), *home.mask.shape[1:3])
+        if not bool(((region > 0.0) & (home.mask[0] > 0.0)).any()):
+            raise InputError(f"the region in {config.mask.name} is empty: it misses the object")
+        return cls(edits, home, region, ctx.event)
+
+    def __call__(self, gbuffer: GBuffer, index: int) -> GBuffer:
+        """The same view in other paint."""
+        if not self.edits:
+            return gbuffer
+        region = (gbuffer.mask > 0.0).float()
+        if self.region is not None and self.home is not None:
+            region = region * self._region_in(gbuffer)
+        if not bool((region > 0.0).any()):  # the region lies on a side that this view does not see
+            return gbuffer
+        images, notices = apply_edits(gbuffer.images(), self.edits, region)
+        for notice in notices:
+            self.tell("edit", f"view {index}: {notice}")
+        return GBuffer.of(gbuffer.cameras, images)
+
+    def _region_in(self, gbuffer: GBuffer) -> Float[Tensor, "1 H W 1"]:
+        """The region as another view, or the same, sees it."""
+        if self.home is None or self.region is None:
+            raise ValueError("there is no region")
+        if torch.equal(gbuffer.cameras.c2w, self.home.cameras.c2w):
+            return self.region[None]
+        points = gbuffer.positions(0).view(-1, 3)
+        return region_of_points(points, self.region, self.home).view_as(gbuffer.mask)
+
+    def record(self) -> dict[str, bytes]:
+        """Files from which the edits can be replayed on the asset's textures."""
+        if not self.edits:
+            return {}
+        camera = None if self.home is None else self.home.cameras
+        return EditRecord(self.edits, self.region, camera).files()
+
+
 def _lighting(
-    subject: Subject, light: Float[Tensor, "N N 3"], config: RelightConfig, ctx: Context
+    subject: Subject,
+    paint: _Paint,
+    light: Float[Tensor, "N N 3"],
+    config: RelightConfig,
+    ctx: Context,
 ) -> Callable[[int], Render]:
     """What makes a view ready to be lit from any side."""
     if config.engine == "path":
         return _path_tracing(subject, light, config, ctx)
     pyramid = cached_operator(ctx.shared, len(light), "hybrid", "relighting")(light)
+    shader = _sampling(light, pyramid, config, ctx) if config.quality == "exact" else None
 
     def ready(index: int) -> Render:
-        gbuffer = subject.view(index)
+        gbuffer = paint(subject.view(index), index)
         visibility = None
         if config.occlusion and gbuffer.depth is not None:
             visibility = ScreenVisibility.trace(gbuffer, 0)
@@ -176,6 +252,7 @@ def _lighting(
                 azimuth_deg=azimuth_deg,
                 visibility=visibility,
                 multiple_scattering=config.multiple_scattering,
+                shader=shader,
             )
             lobes = {"diffuse": shading.diffuse, "specular": shading.specular}
             return _averaged(lobes, gbuffer.mask[0], subject.cameras.height)
@@ -183,6 +260,38 @@ def _lighting(
         return render
 
     return ready
+
+
+def _sampling(
+    light: Float[Tensor, "N N 3"], pyramid: EnvironmentPyramid, config: RelightConfig, ctx: Context
+) -> PointShader:
+    """Shading by samples; what bounces between microfacets is added as the split sum has it."""
+    sampled = SampledLight.build(light)
+
+    def shader(
+        normal: Tensor, wo: Tensor, basecolor: Tensor, roughness: Tensor, metallic: Tensor
+    ) -> Shading:
+        points = _turned_to(wo, normal), wo, basecolor, roughness, metallic
+        # The same random numbers for every picture: the light's turn is all that changes.
+        generator = ctx.generator("samples")
+        shading = shade_by_sampling(*points, sampled, samples=config.samples, generator=generator)
+        if not config.multiple_scattering:
+            return shading
+        once, more = (
+            shade(*points, pyramid, multiple_scattering=multiple) for multiple in (False, True)
+        )
+        return Shading(
+            shading.diffuse + more.diffuse - once.diffuse,
+            shading.specular + more.specular - once.specular,
+        )
+
+    return shader
+
+
+def _turned_to(wo: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+    """Normals that face away, as they may at silhouettes, bent until they are seen edge-on."""
+    behind = (MIN_N_DOT_V - dot(normal, wo)).clamp_min(0.0)
+    return normalize(normal + behind * wo)
 
 
 def _averaged(
@@ -205,6 +314,8 @@ def _path_tracing(
 
     if not isinstance(subject, MeshSubject):
         raise InputError("--engine path needs an asset (.glb, .gltf, .obj), these are views")
+    if config.edits:
+        raise InputError("--engine path takes assets as they are; make one by svim3d edit first")
 
     def ready(index: int) -> Render:
         def render(azimuth_deg: float) -> _Picture:

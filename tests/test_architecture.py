@@ -85,6 +85,7 @@ LIGHT = (
     "flows.commands",
     "flows.config",
     "flows.console",
+    "flows.edit",
     "flows.engine",
     "flows.job",
     "flows.options",

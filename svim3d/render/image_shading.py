@@ -6,7 +6,9 @@ pixel that nothing shadows keeps its value exactly, one whose rays are all block
 and blocked rays bring what the pixels they meet send out.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -20,6 +22,11 @@ from svim3d.shading.split_sum import Shading, shade
 
 BOUNCES = 3  # mean PSNR against path-traced pictures: 24.8 dB without, 26.2 with one, 26.3 with 3
 DARKEST = 1e-6  # radiance; below it a lobe counts as unlit, and how it is scaled does not matter
+
+
+# Unit normal and direction to the viewer, basecolor, roughness, metallic -> radiance by lobe, all
+# in the frame of the unturned light.
+PointShader = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Shading]
 
 
 @dataclass(frozen=True)
@@ -49,6 +56,7 @@ def shade_view(
     visibility: ScreenVisibility | None = None,
     bounces: int = BOUNCES,
     multiple_scattering: bool = True,
+    shader: PointShader | None = None,
 ) -> ImageShading:
     """Light one view; on the CPU where `visibility` is given.
 
@@ -61,20 +69,21 @@ def shade_view(
         visibility: of this very view; without it nothing is shadowed.
         bounces: how often light that blocked rays bring is passed on; 0 leaves shadows black.
         multiple_scattering: as in `split_sum.shade`.
+        shader: shades points in the split sum's place; shadows are still looked up in `light`.
     """
+    if shader is None:
+        shader = partial(shade, pyramid=light, multiple_scattering=multiple_scattering)
     pixels = covered_pixels(gbuffer, view) if visibility is None else visibility.pixels
 
     def chosen(image: Tensor) -> Tensor:
         return image.reshape(-1, image.shape[-1])[pixels]
 
-    shading = shade(
+    shading = shader(
         turn_about_y(chosen(gbuffer.normal_world[view]), -azimuth_deg),
         turn_about_y(chosen(gbuffer.view_directions(view)), -azimuth_deg),
         chosen(gbuffer.basecolor[view]),
         chosen(gbuffer.roughness[view]),
         chosen(gbuffer.metallic[view]),
-        light,
-        multiple_scattering=multiple_scattering,
     )
     if visibility is not None:
         shading = _occlude(shading, visibility, light, azimuth_deg, bounces)

@@ -1,0 +1,78 @@
+"""Edit an asset: a GLB with other materials, from edits as text or from the record of a relight.
+
+Not a stage of a pipeline: one small file in, one out.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from stages.errors import InputError
+from svim3d.io.edit_record import EditRecord, read_record, read_region
+from svim3d.io.glb import read_mesh
+from svim3d.io.gltf_edit import MaskOf, edit_glb
+from svim3d.mesh.source_mesh import normalised
+from svim3d.render.pictures import render_gbuffer
+from svim3d.render.regions import region_of_texels, resized_region
+from svim3d.shading.material_edits import Edit
+
+
+def edit_asset(
+    file: Path, texts: Sequence[str], *, mask: Path | None = None, record: Path | None = None
+) -> tuple[bytes, list[str]]:
+    """The asset with other materials, and messages.
+
+    Args:
+        file: a .glb; a record replayed on it was made on views of this very object.
+        texts: edits, applied after those of the record.
+        mask: picture in texture space; white is edited.
+        record: `edits.json` of relit views. Its region is carried to the texels that its view sees.
+
+    Raises:
+        InputError: nothing to do, or something that cannot be done.
+    """
+    try:
+        edits = [Edit.parse(text) for text in texts]
+        if record is not None:
+            kept = read_record(record)
+            edits = [*kept.edits, *edits]
+            if kept.region is not None and mask is not None:
+                raise InputError("the record has a region of its own: leave out --mask")
+            mask_of = None if kept.region is None else _replayed(file, kept)
+        else:
+            mask_of = None if mask is None else _texture_region(read_region(mask))
+        if not edits:
+            raise InputError("nothing to edit: give --edit or --replay")
+        if not file.is_file():
+            raise InputError(f"there is no asset {file}; check the path")
+        return edit_glb(file.read_bytes(), edits, mask_of)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{file.name}: {error}") from error
+
+
+def _texture_region(region: Float[Tensor, "H W 1"]) -> MaskOf:
+    """One region for the textures of all materials."""
+    return lambda _, height, width: resized_region(region, height, width)
+
+
+def _replayed(file: Path, record: EditRecord) -> MaskOf:
+    """The region of a view, on the texels that it sees."""
+    mesh = normalised(read_mesh(file), file.name)
+    if record.camera is None or record.region is None:
+        raise ValueError("the record has no region")
+    seen = render_gbuffer(mesh, record.camera)
+    region = resized_region(record.region, record.camera.height, record.camera.width)
+
+    def mask_of(material: int, height: int, width: int) -> Tensor | None:
+        square = region_of_texels(mesh, material, max(height, width), region, seen)
+        if not bool((square > 0.0).any()):
+            return None
+        found = interpolate(square.permute(2, 0, 1)[None], size=(height, width), mode="bilinear")
+        return found[0].permute(1, 2, 0)
+
+    return mask_of
