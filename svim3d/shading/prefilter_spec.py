@@ -11,7 +11,7 @@ filtered once and looked at closely. Three modes of either:
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 PrefilterMode = Literal["sampled", "exact", "hybrid"]
 PrefilterProfile = Literal["optimisation", "relighting"]
@@ -106,8 +106,7 @@ class PrefilterSpec:
         profile: what the pyramid is for.
 
     Raises:
-        ValueError: `size` is not a power of two from 8 to LARGEST_SIZE, or the mode or the profile
-            is unknown.
+        ValueError: `size` is not a power of two from 8 to LARGEST_SIZE.
     """
 
     size: int
@@ -119,15 +118,6 @@ class PrefilterSpec:
             raise ValueError(
                 f"the environment's size must be a power of two >= 8 and <= {LARGEST_SIZE}, "
                 f"got {self.size}; resample the map"
-            )
-        if self.mode not in get_args(PrefilterMode):
-            raise ValueError(
-                f"the prefilter's mode must be one of {get_args(PrefilterMode)}, got {self.mode!r}"
-            )
-        if self.profile not in get_args(PrefilterProfile):
-            raise ValueError(
-                f"the prefilter's profile must be one of {get_args(PrefilterProfile)}, "
-                f"got {self.profile!r}"
             )
 
     def levels(self) -> tuple[Level, ...]:
