@@ -128,6 +128,12 @@ def test_failing_frames_leave_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@needs_ffmpeg
+def test_what_ffmpeg_says_is_passed_on(tmp_path):
+    with pytest.raises(ValueError, match=r"ffmpeg could not write .*[Nn]o such file"):
+        write_animation(tmp_path / "none" / "a.mp4", iter(frames()), fps=24.0)
+
+
 def test_frames_are_asked_for_one_by_one(tmp_path):
     alive = []
 
