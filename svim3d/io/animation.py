@@ -23,6 +23,7 @@ Pixels = NDArray[np.uint8]
 
 VIDEO_SUFFIXES = (".mp4", ".mov")
 CONSTANT_RATE_FACTOR = "16"  # of H.264; the eye sees no loss, edges stay above 30 dB
+MAX_MESSAGE = 500  # characters of what ffmpeg says when it fails
 FRAME_NAME = "{:04d}.png"
 
 
@@ -123,27 +124,30 @@ def _write_video(file: Path, frames: Iterator[Pixels], fps: float) -> int:
     ffmpeg = find_ffmpeg()
     first = _even(next(frames))
     height, width, _ = first.shape
-    process = subprocess.Popen(
-        [ffmpeg, "-loglevel", "error", "-y", *_video_options(width, height, fps), str(file)],
-        stdin=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
-    assert process.stdin is not None  # asked for above
-    count = 1
-    try:
-        process.stdin.write(first.tobytes())
-        for frame in frames:
-            process.stdin.write(_even(frame).tobytes())
-            count += 1
-    except BrokenPipeError:
-        pass  # ffmpeg has given up; what it said is reported below
-    except BaseException:
-        process.kill()
+    with tempfile.TemporaryFile() as said:  # a pipe would block once it is full
+        process = subprocess.Popen(
+            [ffmpeg, "-loglevel", "error", "-y", *_video_options(width, height, fps), str(file)],
+            stdin=subprocess.PIPE,
+            stderr=said,
+        )
+        assert process.stdin is not None  # asked for above
+        count = 1
+        try:
+            process.stdin.write(first.tobytes())
+            for frame in frames:
+                process.stdin.write(_even(frame).tobytes())
+                count += 1
+        except BrokenPipeError:
+            pass  # ffmpeg has given up; what it said is reported below
+        except BaseException:
+            process.kill()
+            process.communicate()
+            raise
         process.communicate()
-        raise
-    _, message = process.communicate()
-    if process.returncode:
-        raise ValueError(f"ffmpeg could not write {file.name}: {message.decode()[-500:].strip()}")
+        if process.returncode:
+            said.seek(0)
+            message = said.read().decode(errors="replace")[-MAX_MESSAGE:].strip()
+            raise ValueError(f"ffmpeg could not write {file.name}: {message}")
     return count
 
 

@@ -60,11 +60,12 @@ def read_hdr(file: Path) -> NDArray[np.float32]:
 
 def _decode(content: bytes) -> NDArray[np.float32]:
     header = _read_header(content)
-    packed = np.empty((header.scanlines, header.width, 4), np.uint8)
+    values = np.empty((header.scanlines, header.width, 3), np.float32)
+    line = np.empty((header.width, 4), np.uint8)
     position = header.begin
-    for line in packed:
+    for radiance in values:
         position = _read_scanline(content, position, line)
-    values = _float_from_rgbe(packed) / header.scale.astype(np.float32)
+        radiance[:] = _float_from_rgbe(line) / header.scale
     if header.by_column:
         values = values.transpose(1, 0, 2)
     rows = slice(None, None, -1 if header.flip_rows else 1)

@@ -18,7 +18,7 @@ from svim3d.io.limits import check_size
 MODES = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}
 CHANNELS_WITH_OPACITY = (2, 4)  # their last channel is never gamma encoded
 MAX_8BIT, MAX_16BIT = 255.0, 65535.0
-PALETTE_BITS = 5  # per channel, of the colour counts behind a palette
+PALETTE_BITS = 6  # per channel, of the colour counts behind a palette
 PALETTE_SIZE = 256
 GIF_SHORTEST_MS = 20  # browsers slow down what asks for less
 PAPER, INK = 0.11, 0.86  # display-encoded greys of a sheet's background and text
@@ -159,7 +159,7 @@ def contact_sheet(
 
 
 def palette_of_histogram(counts: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """256 colours [256, 3] for pixels counted by their leading 5 bits, red first.
+    """256 colours [256, 3] for pixels counted by their leading 6 bits, red first.
 
     Source: Heckbert 1982, "Color image quantization for frame buffer display" (median cut).
     """
@@ -172,7 +172,7 @@ def palette_of_histogram(counts: NDArray[np.int64]) -> NDArray[np.uint8]:
     # The middle of each bin, but black and white as they are.
     colours = (levels * MAX_8BIT / ((1 << PALETTE_BITS) - 1)).round().astype(np.uint8)
     picture = Image.fromarray(colours[None])
-    quantised = picture.quantize(PALETTE_SIZE, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    quantised = picture.quantize(PALETTE_SIZE, Image.Quantize.MEDIANCUT)
     found = np.array(quantised.getpalette(), np.uint8).reshape(-1, 3)
     return np.pad(found, ((0, PALETTE_SIZE - len(found)), (0, 0)), "edge")
 

@@ -106,7 +106,8 @@ def octahedral_light(
 def automatic_size(height: int, width: int, layout: Layout) -> int:
     """The power of two whose square is nearest the number of texels, from 16 to 512."""
     texels = height * width / (2.0 if layout == "cube cross" and _is_cross(height, width) else 1.0)
-    size = 1 << max(0, round(0.5 * math.log2(texels)))
+    # A tie, H x 2 H with H a power of two, goes down to H: its texels are 1/9 wider than the rows.
+    size = 1 << max(0, math.ceil(0.5 * math.log2(texels) - 0.5))
     return min(max(size, MIN_SIZE), MAX_AUTOMATIC_SIZE)
 
 

@@ -74,7 +74,9 @@ def test_gif_keeps_a_small_highlight(tmp_path):
     write_animation(tmp_path / "a.gif", [frame, frame], fps=10.0)
     with Image.open(tmp_path / "a.gif") as picture:
         shown = np.asarray(picture.convert("RGB"))[100, 100] / 255.0
-    assert np.abs(shown - [1.0, 0.5, 0.0]).max() < 0.04  # a colour's leading five bits
+    assert (
+        np.abs(shown - [1.0, 0.5, 0.0]).max() < 0.04
+    )  # a colour's leading bits and its neighbours'
 
 
 def test_equal_frames_give_equal_bytes(tmp_path):
@@ -124,6 +126,12 @@ def test_failing_frames_leave_nothing_behind(tmp_path):
         with pytest.raises(RuntimeError, match="light went out"):
             write_animation(tmp_path / name, failing(), fps=24.0)
     assert list(tmp_path.iterdir()) == []
+
+
+@needs_ffmpeg
+def test_what_ffmpeg_says_is_passed_on(tmp_path):
+    with pytest.raises(ValueError, match=r"ffmpeg could not write .*[Nn]o such file"):
+        write_animation(tmp_path / "none" / "a.mp4", iter(frames()), fps=24.0)
 
 
 def test_frames_are_asked_for_one_by_one(tmp_path):

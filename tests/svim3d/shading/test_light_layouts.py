@@ -122,6 +122,7 @@ def test_shape_tells_the_layout(height, width, expected):
 
 def test_automatic_size_keeps_the_number_of_texels():
     assert automatic_size(1, 2, "latlong") == 16
+    assert [automatic_size(h, 2 * h, "latlong") for h in (64, 128, 256)] == [64, 128, 256]
     assert automatic_size(90, 180, "latlong") == 128
     assert automatic_size(256, 256, "octahedral") == 256
     assert automatic_size(3 * 64, 4 * 64, "cube cross") == 128  # 6 * 64^2 texels, half are paper
