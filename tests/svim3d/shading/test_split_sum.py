@@ -6,6 +6,7 @@ import torch
 
 from svim3d.numerics import dot, normalize
 from svim3d.shading.environment import rotate_about_y
+from svim3d.shading.environment_sampling import SampledLight
 from svim3d.shading.monte_carlo import shade_by_sampling
 from svim3d.shading.octahedral import texel_directions
 from svim3d.shading.prefilter import EnvironmentPyramid, PyramidOperator
@@ -164,7 +165,7 @@ def test_sampling_reference_in_a_white_furnace():
     def sampled(metallic):
         generator = torch.Generator().manual_seed(0)
         shading = shade_by_sampling(
-            normal, wo, white, roughness, metallic, torch.ones(4, 4, 3).double(),
+            normal, wo, white, roughness, metallic, SampledLight.build(torch.ones(4, 4, 3).double()),
             samples=64, generator=generator,
         )  # fmt: skip
         return (s.view(repeats, 12, 3).mean(0) for s in (shading.specular, shading.radiance))
@@ -191,7 +192,14 @@ def test_split_sum_is_close_to_the_sampled_truth(roughness, n_dot_v, bias):
     r, one = roughness * white[:, :1], white[:, :1]
     environment = smooth_environment()
     truth = shade_by_sampling(
-        normal, wo, white, r, one, environment, samples=samples, generator=generator
+        normal,
+        wo,
+        white,
+        r,
+        one,
+        SampledLight.build(environment),
+        samples=samples,
+        generator=generator,
     )
     pyramid = PyramidOperator.build(SIZE, "exact")(environment)
     found = shade(normal, wo, white, r, one, pyramid, multiple_scattering=False)
