@@ -46,13 +46,13 @@ class Technique(IntEnum):
 
 
 def specular_brdf(
-    n_dot_wo: Float[Tensor, "*batch 1"],
-    n_dot_wi: Float[Tensor, "*batch 1"],
-    n_dot_wh: Float[Tensor, "*batch 1"],
-    wo_dot_wh: Float[Tensor, "*batch 1"],
-    f0: Float[Tensor, "*batch 3"],
-    alpha: Float[Tensor, "*batch 1"],
-) -> Float[Tensor, "*batch 3"]:
+    n_dot_wo: Float[Tensor, "*#batch 1"],
+    n_dot_wi: Float[Tensor, "*#batch 1"],
+    n_dot_wh: Float[Tensor, "*#batch 1"],
+    wo_dot_wh: Float[Tensor, "*#batch 1"],
+    f0: Float[Tensor, "*#batch 3"],
+    alpha: Float[Tensor, "*#batch 1"],
+) -> Float[Tensor, "*#batch 3"]:
     """Cook-Torrance reflectance F D G2 / (4 n.wo n.wi), for both cosines above zero.
 
     Source: Walter et al. 2007, eq. 20.
@@ -178,9 +178,7 @@ def _shade_chunk(
     if visibility is not None:
         through = visibility(index.repeat_interleave(samples), world)
         incoming = incoming * through.view_as(cosine)
-    lobe = specular_brdf(
-        wo[..., 2:], cosine, wh[..., 2:], dot(wo, wh), surface.f0[:, None].expand_as(wi), alpha
-    )
+    lobe = specular_brdf(wo[..., 2:], cosine, wh[..., 2:], dot(wo, wh), surface.f0[:, None], alpha)
     return surface.base * incoming.sum(1), (lobe * incoming).sum(1)
 
 
