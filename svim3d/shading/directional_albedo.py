@@ -34,7 +34,9 @@ SCHLICK_MEAN_WEIGHT = 1.0 / 21.0  # cosine-weighted mean of (1 - cos)^5
 
 @functools.lru_cache(maxsize=8)
 def split_sum_table(device: torch.device, dtype: torch.dtype) -> Float[Tensor, "r v 3"]:
-    """The table of A, B and the lobe's bend: rows roughness, columns sqrt(n.v), from 0 to 1, both ends included.
+    """The table of A, B and the lobe's bend.
+
+    Rows: roughness, columns: sqrt(n.v), from 0 to 1, both ends included.
 
     The square root gives grazing angles, where smooth materials change fast, their resolution.
     """
@@ -111,8 +113,9 @@ def lobe_albedos(
     With f0 = 1 and either kind of multiple scattering they sum to one: the white furnace.
 
     Source: Fdez-Aguera 2019, eq. 13 to 19; "scaled": Turquin 2019, "Practical multiple scattering
-    compensation for microfacet models", eq. 16, its F the material's F0. The first differs from the paper: F0 A + B takes plain F0; the
-    listing's roughness-dependent Fresnel term counts the grazing reflection twice.
+    compensation for microfacet models": 1 + F0 (1 - E)/E. The first differs from its paper:
+    F0 A + B takes plain F0; the listing's roughness-dependent Fresnel term counts the grazing
+    reflection twice.
     """
     scale, bias = lookup_split_sum(n_dot_v, roughness)
     single = f0 * scale + bias

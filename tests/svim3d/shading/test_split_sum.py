@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from svim3d.numerics import dot, normalize
+from svim3d.shading.directional_albedo import lookup_table
+from svim3d.shading.dominant_lobe import BEND, dominant_direction
 from svim3d.shading.environment import rotate_about_y
 from svim3d.shading.monte_carlo import shade_by_sampling
 from svim3d.shading.octahedral import texel_directions
@@ -14,6 +16,7 @@ from svim3d.shading.split_sum import shade, shade_plainly
 from svim3d.shading.stored_shading import StoredShading
 
 SIZE = 32
+ROTATION_TOLERANCE = 1e-4
 
 
 def smooth_environment(size: int = SIZE) -> torch.Tensor:
@@ -54,13 +57,14 @@ def test_compiled_kernel_equals_its_plain_twin(multiple_scattering):
         torch.testing.assert_close(fast, plain)
 
 
-def test_kernel_gradients_are_derivatives():
+@pytest.mark.parametrize("multiple_scattering", [True, False, "scaled"])
+def test_kernel_gradients_are_derivatives(multiple_scattering):
     operator = PyramidOperator.build(8, "exact")
     points = [t.requires_grad_() for t in random_points(6, seed=4)]
     environment = smooth_environment(8).requires_grad_()
 
     def chain(radiance, *inputs):
-        shading = shade(*inputs, operator(radiance))
+        shading = shade(*inputs, operator(radiance), multiple_scattering=multiple_scattering)
         return shading.diffuse, shading.specular
 
     assert torch.autograd.gradcheck(chain, (environment, *points))
@@ -108,14 +112,51 @@ def test_nan_stays_with_its_point():
     torch.testing.assert_close(shade(*points, pyramid).radiance[4], expected[4])
 
 
-def test_white_furnace():
-    # A white metal in white light vanishes; so does a white dielectric: nothing absorbs.
+@pytest.mark.parametrize("multiple_scattering", [True, "scaled"])
+def test_white_furnace(multiple_scattering):
+    # White in white light vanishes, metal, dielectric or between: nothing absorbs. Between, F0 and
+    # base are both white shares: F0 = 0.04 (1 - m) + m, base = 1 - m times what is transmitted.
     operator = PyramidOperator.build(SIZE, "exact")
     pyramid = operator(torch.ones(SIZE, SIZE, 3, dtype=torch.float64))
-    normal, wo, _, roughness, metallic = random_points(2000)
-    white = torch.ones(2000, 3, dtype=torch.float64)
-    radiance = shade(normal, wo, white, roughness, metallic.round(), pyramid).radiance
-    torch.testing.assert_close(radiance, white, rtol=0, atol=1e-6)
+    axis = torch.linspace(0.0, 1.0, 21, dtype=torch.float64)
+    grid = torch.meshgrid(axis, axis, axis.new_tensor([0.0, 1.0]), indexing="ij")
+    roughness, n_dot_v, metallic = (t.reshape(-1, 1) for t in grid)
+    white = torch.ones(len(roughness), 3, dtype=torch.float64)
+    normal = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(white)
+    wo = torch.cat([(1.0 - n_dot_v**2).sqrt(), 0.0 * n_dot_v, n_dot_v], -1)
+    shading = shade(
+        normal, wo, white, roughness, metallic, pyramid, multiple_scattering=multiple_scattering
+    )
+    torch.testing.assert_close(shading.radiance, white, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("multiple_scattering", [True, "scaled"])
+def test_material_between_metal_and_dielectric_loses_what_glTF_loses(multiple_scattering):
+    # A white half metal absorbs: the base has 1 - m of what the lobe of the mean F0 lets through.
+    operator = PyramidOperator.build(SIZE, "exact")
+    pyramid = operator(torch.ones(SIZE, SIZE, 3, dtype=torch.float64))
+    normal, wo, _, roughness, metallic = random_points(500)
+    white = torch.ones(500, 3, dtype=torch.float64)
+    shading = shade(
+        normal, wo, white, roughness, metallic, pyramid, multiple_scattering=multiple_scattering
+    )
+    expected = 1.0 - metallic * (1.0 - shading.specular)
+    torch.testing.assert_close(shading.radiance, expected, rtol=0, atol=1e-6)
+
+
+def test_mirror_does_not_bend():
+    normal, wo, *_ = random_points(100)
+    n_dot_v = dot(normal, wo)
+    bend = lookup_table(n_dot_v, torch.zeros_like(n_dot_v))[:, 2:]
+    mirror = 2.0 * n_dot_v * normal - wo
+    assert torch.equal(dominant_direction(normal, wo, n_dot_v, bend), mirror)
+
+
+def test_rough_lobe_leans_towards_the_normal_the_more_the_rougher():
+    table = torch.tensor(BEND)
+    assert float(table.min()) >= 0.0
+    assert float(table.max()) <= 1.0
+    assert float((table[1:] - table[:-1]).min()) >= -0.01  # a hundredth is one step of the fit
 
 
 def test_light_and_scene_turn_together():
