@@ -110,7 +110,7 @@ def test_soft_regions_blend():
 def test_regions_that_cannot_be_used_are_refused():
     with pytest.raises(ValueError, match="the region is empty"):
         apply_edits(images(), [Edit.parse("metallic=1")], torch.zeros(4, 4, 1))
-    with pytest.raises(ValueError, match="wanted a region of 4 x 4 pixels .* got 3 x 5"):
+    with pytest.raises(ValueError, match=r"wanted a region of 4 x 4 pixels .* got 3 x 5"):
         apply_edits(images(), [Edit.parse("metallic=1")], torch.ones(5, 3, 1))
 
 
