@@ -33,8 +33,8 @@ def brute_force(radiance: torch.Tensor, axes: torch.Tensor, roughness: float | N
 
 
 # The worst level's relative RMS error at its texels under random lamps in every texel, the hardest
-# light there is: measured, and 15 % above. Hybrid's worst level is the one of roughness 0.1, which
-# is read between texels as wide as five lobes of a map so small; all others are within 0.04.
+# light there is: measured, and 15 % above. Hybrid's worst is the level of roughness 0.1, which is
+# read between texels as wide as five lobes in a map so small; all others are within 0.04.
 @pytest.mark.parametrize(
     ("mode", "profile", "tolerance"),
     [
