@@ -16,7 +16,6 @@ from svim3d.shading.split_sum import shade, shade_plainly
 from svim3d.shading.stored_shading import StoredShading
 
 SIZE = 32
-ROTATION_TOLERANCE = 1e-4
 
 
 def smooth_environment(size: int = SIZE) -> torch.Tensor:
@@ -114,8 +113,7 @@ def test_nan_stays_with_its_point():
 
 @pytest.mark.parametrize("multiple_scattering", [True, "scaled"])
 def test_white_furnace(multiple_scattering):
-    # White in white light vanishes, metal, dielectric or between: nothing absorbs. Between, F0 and
-    # base are both white shares: F0 = 0.04 (1 - m) + m, base = 1 - m times what is transmitted.
+    # White metals and white dielectrics vanish in white light: nothing absorbs.
     operator = PyramidOperator.build(SIZE, "exact")
     pyramid = operator(torch.ones(SIZE, SIZE, 3, dtype=torch.float64))
     axis = torch.linspace(0.0, 1.0, 21, dtype=torch.float64)
@@ -131,7 +129,7 @@ def test_white_furnace(multiple_scattering):
 
 
 @pytest.mark.parametrize("multiple_scattering", [True, "scaled"])
-def test_material_between_metal_and_dielectric_loses_what_glTF_loses(multiple_scattering):
+def test_material_between_metal_and_dielectric_absorbs_as_stated(multiple_scattering):
     # A white half metal absorbs: the base has 1 - m of what the lobe of the mean F0 lets through.
     operator = PyramidOperator.build(SIZE, "exact")
     pyramid = operator(torch.ones(SIZE, SIZE, 3, dtype=torch.float64))
@@ -160,23 +158,23 @@ def test_rough_lobe_leans_towards_the_normal_the_more_the_rougher():
 
 
 def test_light_and_scene_turn_together_by_any_angle():
-    # The light is a function of direction, so nothing is resampled: the reference by samples has
-    # no preferred axis. (The octahedral map of split sum turns exactly by quarter turns alone.)
+    # The light is evaluated anew in its turned directions, so that only the pyramid's own lookups
+    # differ: bilinear in levels of 8 to 64 texels, up to 3 % of the mean at creases of the map.
     angle = math.radians(37.0)
     c, s = math.cos(angle), math.sin(angle)
     turn = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
-    d = texel_directions(256).double()
+    d = texel_directions(64).double()
     lamp = normalize(torch.tensor([0.5, 0.6, 0.6], dtype=torch.float64))
-    normal, wo, *materials = random_points(40)
-    operator, results = PyramidOperator.build(256, "exact"), []
+    normal, wo, *materials = random_points(200)
+    operator, results = PyramidOperator.build(64, "exact"), []
     for rotation in (torch.eye(3, dtype=torch.float64), turn):
-        # A quadratic light: bilinear lookup of 256^2 texels is right to 1e-5.
         cosine = d @ (rotation @ lamp)
         light = (1.0 + cosine + 0.5 * cosine**2)[..., None].expand(-1, -1, 3)
-        pyramid = operator(light)
-        results.append(shade(normal @ rotation.T, wo @ rotation.T, *materials, pyramid).radiance)
-    error = (results[1] - results[0]).abs().max() / results[0].mean()
-    assert float(error) < ROTATION_TOLERANCE
+        turned = (normal @ rotation.T, wo @ rotation.T)
+        results.append(shade(*turned, *materials, operator(light)).radiance)
+    difference = (results[1] - results[0]).abs() / results[0].mean()
+    assert float(difference.max()) < 0.04
+    assert float(difference.mean()) < 0.005
 
 
 def test_light_and_scene_turn_together():
