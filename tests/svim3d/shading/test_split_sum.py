@@ -16,7 +16,6 @@ from svim3d.shading.split_sum import shade, shade_plainly
 from svim3d.shading.stored_shading import StoredShading
 
 SIZE = 32
-ROTATION_TOLERANCE = 1e-4
 
 
 def smooth_environment(size: int = SIZE) -> torch.Tensor:
@@ -114,8 +113,7 @@ def test_nan_stays_with_its_point():
 
 @pytest.mark.parametrize("multiple_scattering", [True, "scaled"])
 def test_white_furnace(multiple_scattering):
-    # White in white light vanishes, metal, dielectric or between: nothing absorbs. Between, F0 and
-    # base are both white shares: F0 = 0.04 (1 - m) + m, base = 1 - m times what is transmitted.
+    # White metals and white dielectrics vanish in white light: nothing absorbs.
     operator = PyramidOperator.build(SIZE, "exact")
     pyramid = operator(torch.ones(SIZE, SIZE, 3, dtype=torch.float64))
     axis = torch.linspace(0.0, 1.0, 21, dtype=torch.float64)
@@ -131,7 +129,7 @@ def test_white_furnace(multiple_scattering):
 
 
 @pytest.mark.parametrize("multiple_scattering", [True, "scaled"])
-def test_material_between_metal_and_dielectric_loses_what_glTF_loses(multiple_scattering):
+def test_material_between_metal_and_dielectric_absorbs_as_stated(multiple_scattering):
     # A white half metal absorbs: the base has 1 - m of what the lobe of the mean F0 lets through.
     operator = PyramidOperator.build(SIZE, "exact")
     pyramid = operator(torch.ones(SIZE, SIZE, 3, dtype=torch.float64))
@@ -157,6 +155,26 @@ def test_rough_lobe_leans_towards_the_normal_the_more_the_rougher():
     assert float(table.min()) >= 0.0
     assert float(table.max()) <= 1.0
     assert float((table[1:] - table[:-1]).min()) >= -0.01  # a hundredth is one step of the fit
+
+
+def test_light_and_scene_turn_together_by_any_angle():
+    # The light is evaluated anew in its turned directions, so that only the pyramid's own lookups
+    # differ: bilinear in levels of 8 to 64 texels, up to 3 % of the mean at creases of the map.
+    angle = math.radians(37.0)
+    c, s = math.cos(angle), math.sin(angle)
+    turn = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
+    d = texel_directions(64).double()
+    lamp = normalize(torch.tensor([0.5, 0.6, 0.6], dtype=torch.float64))
+    normal, wo, *materials = random_points(200)
+    operator, results = PyramidOperator.build(64, "exact"), []
+    for rotation in (torch.eye(3, dtype=torch.float64), turn):
+        cosine = d @ (rotation @ lamp)
+        light = (1.0 + cosine + 0.5 * cosine**2)[..., None].expand(-1, -1, 3)
+        turned = (normal @ rotation.T, wo @ rotation.T)
+        results.append(shade(*turned, *materials, operator(light)).radiance)
+    difference = (results[1] - results[0]).abs() / results[0].mean()
+    assert float(difference.max()) < 0.04
+    assert float(difference.mean()) < 0.005
 
 
 def test_light_and_scene_turn_together():
@@ -203,11 +221,13 @@ def test_sampling_reference_in_a_white_furnace():
     white, one = torch.ones(count, 3, dtype=torch.float64), torch.ones(count, 1).double()
     pyramid = PyramidOperator.build(8, "exact")(torch.ones(8, 8, 3, dtype=torch.float64))
 
+    light = SampledLight.build(torch.ones(4, 4, 3).double())
+
     def sampled(metallic):
         generator = torch.Generator().manual_seed(0)
         shading = shade_by_sampling(
-            normal, wo, white, roughness, metallic, SampledLight.build(torch.ones(4, 4, 3)),
-            samples=128, generator=generator,
+            normal, wo, white, roughness, metallic, light,
+            samples=64, generator=generator,
         )  # fmt: skip
         return (s.view(repeats, 12, 3).mean(0) for s in (shading.specular, shading.radiance))
 
@@ -225,7 +245,7 @@ def test_sampling_reference_in_a_white_furnace():
 def test_split_sum_is_close_to_the_sampled_truth(roughness, n_dot_v, bias):
     # The stated bias (relative, mean over directions) is split-sum's own, under a soft lamp.
     generator = torch.Generator().manual_seed(0)
-    count, samples = 60, 512
+    count, samples = 60, 2048
     normal, other, *_ = random_points(count, seed=7)
     tangent = normalize(other - dot(other, normal) * normal)
     wo = n_dot_v * normal + math.sqrt(1 - n_dot_v**2) * tangent
