@@ -40,7 +40,7 @@ def shade_forward(
     for p in numba.prange(len(normal)):
         r, m = float(roughness[p, 0]), float(metallic[p, 0])
         raw = _dot(normal[p], wo[p])
-        (scale, bias, bend), _, _ = _table_lookup(table, min(max(raw, MIN_N_DOT_V), 1.0), r)
+        (scale, bias, bend), _, _ = _table_lookup(table, raw, r)
         dx, dy, dz = _direction(normal[p], wo[p], raw, bend)
         level, fraction, _ = _level(knots, r)
         sharp = _locate(dx, dy, dz, sizes[level])
@@ -81,8 +81,7 @@ def shade_backward(
         for p in range(chunk * count // chunks, (chunk + 1) * count // chunks):
             r, m = float(roughness[p, 0]), float(metallic[p, 0])
             raw = _dot(normal[p], wo[p])
-            n_dot_v = min(max(raw, MIN_N_DOT_V), 1.0)
-            (scale, bias, bend), along_v, along_r = _table_lookup(table, n_dot_v, r)
+            (scale, bias, bend), along_v, along_r = _table_lookup(table, raw, r)
             dx, dy, dz = _direction(normal[p], wo[p], raw, bend)
             level, fraction, slope = _level(knots, r)
             sharp = _locate(dx, dy, dz, sizes[level])
@@ -119,10 +118,10 @@ def shade_backward(
             g_around = _square_adjoint(nx, ny, nz, g_around_u, g_around_v)
             g_bend = _bend_adjoint(normal[p], wo[p], raw, g_direction)
             g_table = (g_scale, g_bias, g_bend)
-            g_dot = _inner(g_table, along_v) if MIN_N_DOT_V <= raw <= 1.0 else 0.0
+            g_dot = _inner(g_table, along_v)
             grad_roughness[p, 0] = _inner(g_table, along_r) + g_fraction * slope
-            grads = (grad_normal[p], grad_wo[p])
-            _direction_adjoint(normal[p], wo[p], raw, bend, g_direction, g_around, g_dot, grads)
+            to = (grad_normal[p], grad_wo[p])
+            _direction_adjoint(normal[p], wo[p], raw, bend, g_direction, g_around, g_dot, to)
             grad_metallic[p, 0] = g_m
 
 
@@ -244,14 +243,15 @@ def _inner(a: Triple, b: Triple) -> float:
 
 
 @kernel()
-def _table_lookup(table: Array, n_dot_v: float, r: float) -> tuple[Triple, Triple, Triple]:
-    """(A, B, bend), and their derivatives by n.v and by roughness."""
-    root, span = math.sqrt(n_dot_v), TABLE_SIZE - 1
+def _table_lookup(table: Array, raw: float, r: float) -> tuple[Triple, Triple, Triple]:
+    """(A, B, bend), and their derivatives by n.v, which is brought within its bounds, and by r."""
+    root, span = math.sqrt(min(max(raw, MIN_N_DOT_V), 1.0)), TABLE_SIZE - 1
     x, y = root * span, min(max(r, 0.0), 1.0) * span
     # Bounded from below too: a NaN must come out as NaN, not as a read outside the table.
     x0, y0 = max(0, min(int(x), TABLE_SIZE - 2)), max(0, min(int(y), TABLE_SIZE - 2))
     at = (x0, y0, x - x0, y - y0)
-    per_x, per_y = span / (2.0 * root), float(span) if 0.0 <= r <= 1.0 else 0.0
+    per_x = span / (2.0 * root) if MIN_N_DOT_V <= raw <= 1.0 else 0.0
+    per_y = float(span) if 0.0 <= r <= 1.0 else 0.0
     a, a_v, a_r = _table_channel(table, at, 0)
     b, b_v, b_r = _table_channel(table, at, 1)
     bend, bend_v, bend_r = _table_channel(table, at, 2)
