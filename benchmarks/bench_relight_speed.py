@@ -16,6 +16,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -28,10 +29,10 @@ from stages.subject import BUFFERS  # noqa: E402
 from svim3d.io.light import read_light  # noqa: E402
 from svim3d.io.orbit import read_orbit  # noqa: E402
 from svim3d.render.gbuffer import GBuffer  # noqa: E402
-from svim3d.render.image_shading import shade_view  # noqa: E402
+from svim3d.render.image_shading import ViewPoints  # noqa: E402
 from svim3d.render.screen_visibility import ScreenVisibility  # noqa: E402
 from svim3d.shading.environment import rotate_about_y  # noqa: E402
-from svim3d.shading.prefilter import EnvironmentPyramid, PyramidOperator  # noqa: E402
+from svim3d.shading.prefilter import PyramidOperator  # noqa: E402
 from svim3d.shading.split_sum import Shading, shade_plainly  # noqa: E402
 from svim3d.shading.tonemap import agx  # noqa: E402
 
@@ -51,39 +52,31 @@ def resized(gbuffer: GBuffer, size: int) -> GBuffer:
     return GBuffer.of(gbuffer.cameras.resized(size, size), images)
 
 
-def displayed(radiance: Tensor) -> Tensor:
-    """8-bit display values."""
-    return (agx(radiance) * 255.0).round().to(torch.uint8)
-
-
-def plainly(*points: Tensor, pyramid: EnvironmentPyramid) -> Shading:
-    """Shading by the torch twin."""
-    return shade_plainly(*points, pyramid, multiple_scattering=True)
+def displayed(points: ViewPoints, shading: Shading) -> Tensor:
+    """The picture in 8-bit display values."""
+    return points.image((agx(shading.radiance) * 255.0).round().to(torch.uint8))
 
 
 def methods(gbuffer: GBuffer, light: Tensor) -> dict[str, tuple[Frame, float]]:
     """Frame functions by name, and the seconds that each view costs once."""
-    operator = PyramidOperator.build(LIGHT_SIZE, "hybrid", "relighting")
-    pyramid = operator(light)
+    pyramid = PyramidOperator.build(LIGHT_SIZE, "hybrid", "relighting")(light)
     paper = PyramidOperator.build(LIGHT_SIZE, "sampled")
+    points = ViewPoints.of(gbuffer, 0)
+    ScreenVisibility.trace(gbuffer, 0)  # compiles
     start = time.perf_counter()
-    visibility = ScreenVisibility.trace(gbuffer, 0)
+    traced = ViewPoints.of(gbuffer, 0, ScreenVisibility.trace(gbuffer, 0))
     traced_s = time.perf_counter() - start
 
     def baseline(azimuth: float) -> Tensor:
         turned = paper(rotate_about_y(light, azimuth))
-
-        def shader(*points: Tensor) -> Shading:
-            return plainly(*points, pyramid=turned)
-
-        return displayed(shade_view(gbuffer, 0, turned, shader=shader).radiance)
+        shader = partial(shade_plainly, pyramid=turned, multiple_scattering=True)
+        return displayed(points, points.lit(turned, shader=shader))
 
     def open_air(azimuth: float) -> Tensor:
-        return displayed(shade_view(gbuffer, 0, pyramid, azimuth_deg=azimuth).radiance)
+        return displayed(points, points.lit(pyramid, azimuth_deg=azimuth))
 
     def occluded(azimuth: float) -> Tensor:
-        shading = shade_view(gbuffer, 0, pyramid, azimuth_deg=azimuth, visibility=visibility)
-        return displayed(shading.radiance)
+        return displayed(traced, traced.lit(pyramid, azimuth_deg=azimuth))
 
     return {
         "paper, plain torch": (baseline, 0.0),

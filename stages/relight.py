@@ -31,7 +31,7 @@ from svim3d.io.image import contact_sheet, encode_png
 from svim3d.io.light import read_light
 from svim3d.numerics import dot, normalize
 from svim3d.render.gbuffer import GBuffer
-from svim3d.render.image_shading import PointShader, shade_view
+from svim3d.render.image_shading import PointShader, ViewPoints
 from svim3d.render.regions import region_of_points, resized_region
 from svim3d.render.screen_visibility import ScreenVisibility
 from svim3d.shading.directional_albedo import MIN_N_DOT_V
@@ -244,18 +244,18 @@ def _lighting(
         elif config.occlusion:
             ctx.event("no_depth", "the views carry no depth: nothing is occluded")
 
+        points = ViewPoints.of(gbuffer, 0, visibility)
+
         def render(azimuth_deg: float) -> _Picture:
-            shading = shade_view(
-                gbuffer,
-                0,
+            shading = points.lit(
                 pyramid,
                 azimuth_deg=azimuth_deg,
-                visibility=visibility,
                 multiple_scattering=config.multiple_scattering,
                 shader=shader,
             )
             lobes = {"diffuse": shading.diffuse, "specular": shading.specular}
-            return _averaged(lobes, gbuffer.mask[0], subject.cameras.height)
+            images = {name: points.image(lobe) for name, lobe in lobes.items()}
+            return _averaged(images, gbuffer.mask[0], subject.cameras.height)
 
         return render
 

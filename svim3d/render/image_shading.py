@@ -9,14 +9,16 @@ and blocked rays bring what the pixels they meet send out.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Self
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from svim3d.render.gbuffer import GBuffer
 from svim3d.render.ray_light import gather_hits, lobe_light, turn_about_y
-from svim3d.render.screen_visibility import LobeRays, ScreenVisibility, covered_pixels
+from svim3d.render.screen_visibility import LobeRays, ScreenVisibility
+from svim3d.shading.directional_albedo import MultipleScattering
 from svim3d.shading.prefilter import EnvironmentPyramid
 from svim3d.shading.split_sum import Shading, shade
 
@@ -27,6 +29,99 @@ DARKEST = 1e-6  # radiance; below it a lobe counts as unlit, and how it is scale
 # Unit normal and direction to the viewer, basecolor, roughness, metallic -> radiance by lobe, all
 # in the frame of the unturned light.
 PointShader = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Shading]
+
+
+@dataclass(frozen=True)
+class ViewPoints:
+    """The visible points of one view, ready to be lit from any side.
+
+    Attributes:
+        pixels: flat indices of all pixels that show any surface.
+        normal: unit, world frame.
+        wo: unit directions to the viewer, world frame.
+        basecolor: linear.
+        roughness: perceptual.
+        metallic: in [0, 1].
+        visibility: what the mostly covered among them see of each other; None for open air.
+        traced: where these are in `pixels`.
+        height: image rows.
+        width: image columns.
+    """
+
+    pixels: Int[Tensor, "P"]
+    normal: Float[Tensor, "P 3"]
+    wo: Float[Tensor, "P 3"]
+    basecolor: Float[Tensor, "P 3"]
+    roughness: Float[Tensor, "P 1"]
+    metallic: Float[Tensor, "P 1"]
+    visibility: ScreenVisibility | None
+    traced: Int[Tensor, "Q"]
+    height: int
+    width: int
+
+    @classmethod
+    def of(cls, gbuffer: GBuffer, view: int, visibility: ScreenVisibility | None = None) -> Self:
+        """Collect the points of a view; `visibility` is of this very view."""
+        pixels = torch.nonzero(gbuffer.mask[view].reshape(-1) > 0.0)[:, 0]
+        traced = pixels if visibility is None else visibility.pixels
+
+        def chosen(image: Tensor) -> Tensor:
+            return image.reshape(-1, image.shape[-1])[pixels]
+
+        return cls(
+            pixels=pixels,
+            normal=chosen(gbuffer.normal_world[view]),
+            wo=chosen(gbuffer.view_directions(view)),
+            basecolor=chosen(gbuffer.basecolor[view]),
+            roughness=chosen(gbuffer.roughness[view]),
+            metallic=chosen(gbuffer.metallic[view]),
+            visibility=visibility,
+            traced=torch.searchsorted(pixels, traced),
+            height=gbuffer.cameras.height,
+            width=gbuffer.cameras.width,
+        )
+
+    def lit(
+        self,
+        light: EnvironmentPyramid,
+        *,
+        azimuth_deg: float = 0.0,
+        bounces: int = BOUNCES,
+        multiple_scattering: MultipleScattering = True,
+        shader: PointShader | None = None,
+    ) -> Shading:
+        """Radiance of all points; on the CPU where there is visibility.
+
+        Args:
+            light: the prefiltered environment.
+            azimuth_deg: turns the light counter-clockwise seen from above, as `rotate_about_y`
+                does, but exactly: normals and views are turned the other way instead of the map.
+            bounces: how often light that blocked rays bring is passed on; 0 leaves shadows black.
+            multiple_scattering: as in `split_sum.shade`.
+            shader: shades points in the split sum's place; shadows are looked up in `light` still.
+        """
+        if shader is None:
+            shader = partial(shade, pyramid=light, multiple_scattering=multiple_scattering)
+        shading = shader(
+            turn_about_y(self.normal, -azimuth_deg),
+            turn_about_y(self.wo, -azimuth_deg),
+            self.basecolor,
+            self.roughness,
+            self.metallic,
+        )
+        if self.visibility is None:
+            return shading
+        unshadowed = Shading(shading.diffuse[self.traced], shading.specular[self.traced])
+        occluded = _occlude(unshadowed, self.visibility, light, azimuth_deg, bounces)
+        return Shading(
+            shading.diffuse.index_copy(0, self.traced, occluded.diffuse),
+            shading.specular.index_copy(0, self.traced, occluded.specular),
+        )
+
+    def image(self, values: Float[Tensor, "P C"]) -> Float[Tensor, "H W C"]:
+        """Values of the points as an image, zero where nothing is."""
+        blank = values.new_zeros(self.height * self.width, values.shape[1])
+        return blank.index_copy(0, self.pixels, values).view(self.height, self.width, -1)
 
 
 @dataclass(frozen=True)
@@ -55,45 +150,17 @@ def shade_view(
     azimuth_deg: float = 0.0,
     visibility: ScreenVisibility | None = None,
     bounces: int = BOUNCES,
-    multiple_scattering: bool = True,
-    shader: PointShader | None = None,
+    multiple_scattering: MultipleScattering = True,
 ) -> ImageShading:
-    """Light one view; on the CPU where `visibility` is given.
-
-    Args:
-        gbuffer: materials and normals.
-        view: which of its views.
-        light: the prefiltered environment.
-        azimuth_deg: turns the light counter-clockwise seen from above, as `rotate_about_y` does,
-            but exactly: normals and views are turned the other way instead of the map.
-        visibility: of this very view; without it nothing is shadowed.
-        bounces: how often light that blocked rays bring is passed on; 0 leaves shadows black.
-        multiple_scattering: as in `split_sum.shade`.
-        shader: shades points in the split sum's place; shadows are still looked up in `light`.
-    """
-    if shader is None:
-        shader = partial(shade, pyramid=light, multiple_scattering=multiple_scattering)
-    pixels = covered_pixels(gbuffer, view) if visibility is None else visibility.pixels
-
-    def chosen(image: Tensor) -> Tensor:
-        return image.reshape(-1, image.shape[-1])[pixels]
-
-    shading = shader(
-        turn_about_y(chosen(gbuffer.normal_world[view]), -azimuth_deg),
-        turn_about_y(chosen(gbuffer.view_directions(view)), -azimuth_deg),
-        chosen(gbuffer.basecolor[view]),
-        chosen(gbuffer.roughness[view]),
-        chosen(gbuffer.metallic[view]),
+    """Light one view once; arguments as in `ViewPoints`."""
+    points = ViewPoints.of(gbuffer, view, visibility)
+    shading = points.lit(
+        light,
+        azimuth_deg=azimuth_deg,
+        bounces=bounces,
+        multiple_scattering=multiple_scattering,
     )
-    if visibility is not None:
-        shading = _occlude(shading, visibility, light, azimuth_deg, bounces)
-    shape = (*gbuffer.mask.shape[1:3], 3)
-
-    def image(lobe: Tensor) -> Tensor:
-        blank = lobe.new_zeros(shape).view(-1, 3)
-        return blank.index_copy(0, pixels, lobe).view(shape)
-
-    return ImageShading(image(shading.diffuse), image(shading.specular))
+    return ImageShading(points.image(shading.diffuse), points.image(shading.specular))
 
 
 def _occlude(
