@@ -53,8 +53,9 @@ def region_of_points(
     grid = position.view(1, 1, -1, 2)
     share = grid_sample(images[:, :1], grid, mode="bilinear", align_corners=False)
     depth = grid_sample(images[:, 1:], grid, mode="nearest", align_corners=False)
-    is_seen = (depth.view(-1, 1) > 0.0) & (clip[:, 3:] <= depth.view(-1, 1) + DEPTH_SLACK)
-    return share.view(-1, 1) * is_seen
+    depth = depth.view(-1, 1)
+    is_ahead = (clip[:, 3:] > 0.0) & (depth > 0.0)
+    return share.view(-1, 1) * (is_ahead & (clip[:, 3:] <= depth + DEPTH_SLACK))
 
 
 def region_of_texels(
