@@ -30,7 +30,6 @@ from svim3d.io.light import read_light  # noqa: E402
 from svim3d.io.orbit import read_orbit  # noqa: E402
 from svim3d.render.gbuffer import GBuffer  # noqa: E402
 from svim3d.render.image_shading import ViewPoints  # noqa: E402
-from svim3d.render.screen_visibility import ScreenVisibility  # noqa: E402
 from svim3d.shading.environment import rotate_about_y  # noqa: E402
 from svim3d.shading.prefilter import PyramidOperator  # noqa: E402
 from svim3d.shading.split_sum import Shading, shade_plainly  # noqa: E402
@@ -62,9 +61,9 @@ def methods(gbuffer: GBuffer, light: Tensor) -> dict[str, tuple[Frame, float]]:
     pyramid = PyramidOperator.build(LIGHT_SIZE, "hybrid", "relighting")(light)
     paper = PyramidOperator.build(LIGHT_SIZE, "sampled")
     points = ViewPoints.of(gbuffer, 0)
-    ScreenVisibility.trace(gbuffer, 0)  # compiles
+    ViewPoints.occluded(gbuffer, 0)  # compiles
     start = time.perf_counter()
-    traced = ViewPoints.of(gbuffer, 0, ScreenVisibility.trace(gbuffer, 0))
+    traced = ViewPoints.occluded(gbuffer, 0)
     traced_s = time.perf_counter() - start
 
     def baseline(azimuth: float) -> Tensor:

@@ -33,7 +33,6 @@ from svim3d.numerics import dot, normalize
 from svim3d.render.gbuffer import GBuffer
 from svim3d.render.image_shading import PointShader, ViewPoints
 from svim3d.render.regions import region_of_points, resized_region
-from svim3d.render.screen_visibility import ScreenVisibility
 from svim3d.shading.directional_albedo import MIN_N_DOT_V
 from svim3d.shading.environment import latlong_from_octahedral, rotate_about_y
 from svim3d.shading.material_edits import Edit, apply_edits
@@ -238,13 +237,10 @@ def _lighting(
 
     def ready(index: int) -> Render:
         gbuffer = paint(subject.view(index), index)
-        visibility = None
-        if config.occlusion and gbuffer.depth is not None:
-            visibility = ScreenVisibility.trace(gbuffer, 0)
-        elif config.occlusion:
+        if config.occlusion and gbuffer.depth is None:
             ctx.event("no_depth", "the views carry no depth: nothing is occluded")
-
-        points = ViewPoints.of(gbuffer, 0, visibility)
+        is_occluded = config.occlusion and gbuffer.depth is not None
+        points = (ViewPoints.occluded if is_occluded else ViewPoints.of)(gbuffer, 0)
 
         def render(azimuth_deg: float) -> _Picture:
             shading = points.lit(

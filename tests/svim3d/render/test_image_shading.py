@@ -1,6 +1,7 @@
 """Relighting of one view: closed forms of what is seen, and invariance."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -15,8 +16,9 @@ from analytic_views import (
 )
 
 from svim3d.cameras import Cameras
+from svim3d.render import image_shading
 from svim3d.render.gbuffer import GBuffer
-from svim3d.render.image_shading import shade_view
+from svim3d.render.image_shading import ViewPoints, shade_view
 from svim3d.render.ray_light import (
     gather_hits,
     gather_hits_plainly,
@@ -213,3 +215,25 @@ def test_tracing_needs_depth():
     images = {name: image for name, image in gbuffer.images().items() if name != "depth"}
     with pytest.raises(ValueError, match=r"depth\.Z"):
         ScreenVisibility.trace(GBuffer.of(gbuffer.cameras, images), 0)
+
+
+def test_large_views_are_traced_smaller_and_shaded_in_full(monkeypatch):
+    gbuffer, light = ball_on_ground(camera(SIZE)), uniform_light()
+    fine = ViewPoints.occluded(gbuffer, 0)
+    monkeypatch.setattr(image_shading, "TRACED_SIDE", 40)  # neither divides the other
+    coarse = ViewPoints.occluded(gbuffer, 0)
+    assert len(coarse.occluders.points.pixels) < 0.25 * len(fine.occluders.points.pixels)
+    assert torch.equal(coarse.pixels, fine.pixels)
+    one, other = (points.lit(light).radiance for points in (fine, coarse))
+    open_air = ViewPoints.of(gbuffer, 0).lit(light).radiance
+    # Shadows of a picture of 40 pixels lie up to a pixel beside those of 96.
+    assert float((one - other).abs().mean()) < 0.2 * float((one - open_air).abs().mean())
+    far = (one == open_air).all(-1) & (other == open_air).all(-1)
+    assert bool(far.any())
+
+
+def test_thin_coverage_is_shaded_as_in_open_air():
+    gbuffer = ball_on_ground(camera(SIZE))
+    thin = replace(gbuffer, mask=torch.where(gbuffer.mask > 0.0, 0.25, 0.0))
+    shaded = shade_view(thin, 0, uniform_light(), visibility=ScreenVisibility.trace(thin, 0))
+    assert torch.equal(shaded.radiance, shade_view(gbuffer, 0, uniform_light()).radiance)
