@@ -141,7 +141,11 @@ def _add_rendering(options: argparse.ArgumentParser) -> None:
     how.add_argument("--samples", type=int, metavar="N", help="per pixel, where sampled (256)")
     how.add_argument("--occlusion", choices=("on", "off"), default="on", help="(%(default)s)")
     how.add_argument(
-        "--multiple-scattering", choices=("on", "off"), default="on", help="(%(default)s)"
+        "--multiple-scattering",
+        choices=("on", "off", "scaled"),
+        default="on",
+        help="what rough metals lose to one bounce comes back from everywhere, not at all, or "
+        "scales the bounce (%(default)s)",
     )
     how.add_argument(
         "--engine", choices=("raster", "path"), help="for assets; path needs svim3d[path] (raster)"

@@ -21,6 +21,7 @@ from stages.errors import InputError
 ORBIT_INDEX, ASSET = "orbit.json", "asset.glb"
 INSIDE = ("", "files")  # a folder itself, and the payload of a store's artifact
 BUILT_IN_LIGHT = "studio"
+SCATTERING: dict[str, bool | str] = {"on": True, "off": False, "scaled": "scaled"}
 MAX_TURNS = 1440  # of one animation
 
 
@@ -37,7 +38,7 @@ def relight(options: argparse.Namespace) -> int:
         "quality": options.quality,
         "samples": options.samples,
         "occlusion": options.occlusion == "on",
-        "multiple_scattering": options.multiple_scattering == "on",
+        "multiple_scattering": SCATTERING[options.multiple_scattering],
         "engine": options.engine,
         "views": parse_views(options.views),
         "turntable": options.turntable,

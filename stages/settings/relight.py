@@ -43,8 +43,9 @@ class RelightConfig(FileReadingConfig):
     occlusion: bool = True
     """Let the object shadow and light itself, as far as its depth picture shows it."""
 
-    multiple_scattering: bool = True
-    """Give back the energy that rough metals lose to single scattering (Fdez-Aguera 2019)."""
+    multiple_scattering: bool | Literal["scaled"] = True
+    """Give back the energy that rough metals lose to single scattering: as light of all directions
+    (Fdez-Aguera 2019), or by scaling the first bounce (Turquin 2019)."""
 
     engine: Literal["raster", "path"] = "raster"
     """What renders a finished asset: our rasteriser, or Mitsuba's path tracer."""

@@ -90,11 +90,31 @@ class _MaterialEditor:
         before = self._images(size)
         after, notices = apply_edits(before, edits, mask)
         flat = mask is None
-        if _touches(edits, "basecolor"):
+        if _touches(edits, "basecolor") and not (flat and self._scale("basecolor", edits)):
             self._write_basecolor(after["basecolor"], flat=flat and self._basecolor is None)
-        if _touches(edits, "roughness", "metallic"):
+        changed = [
+            name
+            for name in ("roughness", "metallic")
+            if _touches(edits, name) and not (flat and self._scale(name, edits))
+        ]
+        if changed:
             self._write_roughness_metallic(after, flat=flat and self._orm is None)
         return notices
+
+    def _scale(self, channel: str, edits: Sequence[Edit]) -> bool:
+        """Change a channel's factor alone, where edits only scale it and it stays below one."""
+        mine = [edit for edit in edits if edit.channel == channel]
+        name = "baseColorFactor" if channel == "basecolor" else f"{channel}Factor"
+        given = self._shading.get(name, [1.0] * 4 if channel == "basecolor" else 1.0)
+        factor = torch.tensor(given[:3] if channel == "basecolor" else [given])
+        for edit in mine:
+            factor = edit.apply(factor)
+        within = bool(((factor >= 0.0) & (factor <= 1.0)).all())
+        if not within or any(edit.operator not in "*/" for edit in mine):
+            return False
+        scaled = factor.tolist()
+        self._shading[name] = [*scaled, given[3]] if channel == "basecolor" else scaled[0]
+        return True
 
     def _size(self, *, has_region: bool) -> tuple[int, int]:
         """Rows and columns at which the material is edited: those of its largest texture."""

@@ -82,7 +82,7 @@ def test_orbit_becomes_an_asset_and_the_second_run_starts_no_engine(
     assert all((out / name / "manifest.json").is_file() for name in IMAGE_TO_ASSET.names)
     asset = (out / "asset.glb").read_bytes()
 
-    monkeypatch.setattr("flows.commands.Engine", None)  # whoever calls it fails
+    monkeypatch.setattr("flows.job.Engine", None)  # whoever calls it fails
     capsys.readouterr()
     assert command(out) == cli.DONE
     assert capsys.readouterr().out.count(" cached ") == len(IMAGE_TO_ASSET.names)

@@ -133,7 +133,7 @@ def only(views, chosen):
     images = {
         f.name: getattr(views, f.name)[chosen]
         for f in dataclasses.fields(views)
-        if f.name not in ("cameras", "reference")
+        if f.name not in ("cameras", "reference", "depth")
     }
     return MaterialViews(cameras=views.cameras[chosen], reference=0, **images)
 

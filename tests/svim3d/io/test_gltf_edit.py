@@ -73,7 +73,10 @@ def images(content: bytes, tmp_path) -> dict[str, torch.Tensor]:
     }
 
 
-@pytest.mark.parametrize("texts", [["roughness*0.5"], ["basecolor=#aa3311", "metallic=1"]])
+@pytest.mark.parametrize(
+    "texts",
+    [["roughness*0.5"], ["roughness*1.5", "metallic*0.5"], ["basecolor=#aa3311", "metallic=1"]],
+)
 def test_textures_show_what_the_edits_say(tmp_path, texts):
     edits = [Edit.parse(text) for text in texts]
     wanted, _ = apply_edits(images(textured(), tmp_path), edits)
@@ -113,9 +116,26 @@ def test_replaced_images_leave_and_shared_occlusion_stays():
     occlusion = after["materials"][0]["occlusionTexture"]["index"]
     rough = after["materials"][0]["pbrMetallicRoughness"]["metallicRoughnessTexture"]["index"]
     assert occlusion != rough and len(after["images"]) == 3
-    after, _ = split(edit_glb(textured(), [Edit.parse("basecolor*0.5")])[0])
+    after, _ = split(edit_glb(textured(), [Edit.parse("basecolor+0.1")])[0])
     assert len(after["images"]) == 2
     assert all(view["byteLength"] > 0 for view in after["bufferViews"])
+
+
+def test_pure_scales_change_factors_and_no_picture():
+    before, binary = split(textured())
+    edits = [
+        Edit.parse("basecolor*#8080ff"),
+        Edit.parse("roughness/2"),
+        Edit.parse("roughness*0.5"),
+    ]
+    after, edited = split(edit_glb(textured(), edits)[0])
+    assert edited == binary and after["images"] == before["images"]
+    assert after["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"] == 0.25
+    # Half of it scales, half cannot: the picture is painted once.
+    after, _ = split(
+        edit_glb(textured(), [Edit.parse("roughness*2"), Edit.parse("metallic*0.5")])[0]
+    )
+    assert len(after["images"]) == 3
 
 
 def test_factors_alone_stay_factors(tmp_path):
