@@ -351,7 +351,7 @@ def _turntable(frames: Iterator[Tensor], config: RelightConfig, ctx: Context) ->
     """The turning light as one moving picture, or as numbered ones."""
     name = "turntable" if config.turntable == "png" else f"turntable.{config.turntable}"
     made = ctx.work / name
-    write_animation(made, frames, fps=config.frames_per_s)
+    write_animation(made, frames, fps=float(config.frames_per_s))
     if made.is_dir():
         return {f"{name}/{file.name}": file.read_bytes() for file in sorted(made.iterdir())}
     return {name: made.read_bytes()}

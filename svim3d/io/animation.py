@@ -174,7 +174,7 @@ def find_ffmpeg() -> str:
         ValueError: there is none; says how to get one.
     """
     try:
-        import imageio_ffmpeg  # type: ignore[import-not-found, import-untyped, unused-ignore]
+        import imageio_ffmpeg
 
         return str(imageio_ffmpeg.get_ffmpeg_exe())
     except (ImportError, RuntimeError):
