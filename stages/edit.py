@@ -38,14 +38,15 @@ def edit_asset(
     """
     try:
         edits = [Edit.parse(text) for text in texts]
+        mask_of: MaskOf | None = None
         if record is not None:
             kept = read_record(record)
             edits = [*kept.edits, *edits]
             if kept.region is not None and mask is not None:
                 raise InputError("the record has a region of its own: leave out --mask")
             mask_of = None if kept.region is None else _replayed(file, kept)
-        else:
-            mask_of = None if mask is None else _texture_region(read_region(mask))
+        if mask is not None:
+            mask_of = _texture_region(read_region(mask))
         if not edits:
             raise InputError("nothing to edit: give --edit or --replay")
         if not file.is_file():

@@ -60,7 +60,7 @@ def edit_glb(
 
     Raises:
         ValueError: it is no GLB with materials, it is not self-contained, or a region is wanted
-            without texture coordinates.
+            that meets nothing or lacks texture coordinates.
     """
     document = GlbDocument(content)
     try:
@@ -86,7 +86,7 @@ def _edit_document(
         raise ValueError("the file has no materials to edit")
     if mask_of is not None and not any("TEXCOORD_0" in p["attributes"] for p in primitives):
         raise ValueError("a region needs texture coordinates, and the asset has none; unwrap it")
-    notices = []
+    notices, touched = [], False
     for index, material in enumerate(materials):
         users = [p["attributes"] for p in primitives if p.get("material") == index]
         name = material.get("name", f"material {index}")
@@ -95,8 +95,12 @@ def _edit_document(
         elif mask_of is not None and not all("TEXCOORD_0" in attributes for attributes in users):
             told = ["has no texture coordinates for a region; left as it was"]
         else:
-            told = _MaterialEditor(document, material, index).edit(edits, mask_of)
+            editor = _MaterialEditor(document, material, index)
+            told = editor.edit(edits, mask_of)
+            touched = touched or editor.touched
         notices += [f"{name}: {notice}" for notice in told]
+    if mask_of is not None and not touched:
+        raise ValueError("the region is empty: it meets no texel of the asset")
     if any("COLOR_0" in p["attributes"] for p in primitives) and _touches(edits, "basecolor"):
         notices.append("vertex colours go on tinting the edited basecolor")
     return notices
@@ -113,6 +117,7 @@ class _MaterialEditor:
         self._document = document
         self._material = material
         self._index = index
+        self.touched = False
         self._shading: Json = material.get("pbrMetallicRoughness", {})
         self._textures = {
             slot: document.texture(self._shading.get(slot)) for slot in (BASECOLOR, ORM)
@@ -141,6 +146,7 @@ class _MaterialEditor:
             }
             self._write(slot, {name: plane for name, plane in stored.items() if plane is not None})
         if names:
+            self.touched = True
             self._material["pbrMetallicRoughness"] = self._shading
         return notices + _implausible(before, after, list(masks.values()))
 
