@@ -19,6 +19,8 @@ from svim3d.render.pictures import render_gbuffer
 from svim3d.render.regions import region_of_texels, resized_region
 from svim3d.shading.material_edits import Edit
 
+MIN_DEPTH_ROWS = 1024  # of the depth that tells which texels a view sees: about one per texel
+
 
 def edit_asset(
     file: Path, texts: Sequence[str], *, mask: Path | None = None, record: Path | None = None
@@ -36,14 +38,15 @@ def edit_asset(
     """
     try:
         edits = [Edit.parse(text) for text in texts]
+        mask_of: MaskOf | None = None
         if record is not None:
             kept = read_record(record)
             edits = [*kept.edits, *edits]
             if kept.region is not None and mask is not None:
                 raise InputError("the record has a region of its own: leave out --mask")
             mask_of = None if kept.region is None else _replayed(file, kept)
-        else:
-            mask_of = None if mask is None else _texture_region(read_region(mask))
+        if mask is not None:
+            mask_of = _texture_region(read_region(mask))
         if not edits:
             raise InputError("nothing to edit: give --edit or --replay")
         if not file.is_file():
@@ -56,8 +59,14 @@ def edit_asset(
 
 
 def _texture_region(region: Float[Tensor, "H W 1"]) -> MaskOf:
-    """One region for the textures of all materials."""
-    return lambda _, height, width: resized_region(region, height, width)
+    """One region for the textures of all materials, whatever their proportions."""
+
+    def mask_of(_: int, height: int, width: int) -> Tensor:
+        moved = region.permute(2, 0, 1)[None]
+        found = interpolate(moved, size=(height, width), mode="bilinear", antialias=True)
+        return found[0].permute(1, 2, 0)
+
+    return mask_of
 
 
 def _replayed(file: Path, record: EditRecord) -> MaskOf:
@@ -65,14 +74,13 @@ def _replayed(file: Path, record: EditRecord) -> MaskOf:
     mesh = normalised(read_mesh(file), file.name)
     if record.camera is None or record.region is None:
         raise ValueError("the record has no region")
-    seen = render_gbuffer(mesh, record.camera)
-    region = resized_region(record.region, record.camera.height, record.camera.width)
+    finer = -(-MIN_DEPTH_ROWS // record.camera.height)
+    size = (record.camera.height * finer, record.camera.width * finer)
+    seen = render_gbuffer(mesh, record.camera.resized(*size))
+    region = resized_region(record.region, *size)
 
     def mask_of(material: int, height: int, width: int) -> Tensor | None:
-        square = region_of_texels(mesh, material, max(height, width), region, seen)
-        if not bool((square > 0.0).any()):
-            return None
-        found = interpolate(square.permute(2, 0, 1)[None], size=(height, width), mode="bilinear")
-        return found[0].permute(1, 2, 0)
+        found = region_of_texels(mesh, material, (height, width), region, seen)
+        return found if bool((found > 0.0).any()) else None
 
     return mask_of

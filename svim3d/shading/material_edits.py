@@ -20,11 +20,13 @@ from svim3d.color import linear_from_srgb, luminance
 
 CHANNELS = {"basecolor": 3, "roughness": 1, "metallic": 1}
 GRAMMAR = re.compile(r"\s*([A-Za-z_]*)\s*([=*/+\-])\s*(\S.*?)\s*")
+NUMBER = re.compile(r"\s*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?\s*")
 HEX_COLOUR = re.compile(r"#(?:[0-9a-fA-F]{3}|[0-9a-fA-F]{6})")
 # Brightness of things that do not conduct, coal to fresh snow: sRGB 30 to 240.
 # Source: Lagarde and de Rousiers 2014, "Moving Frostbite to PBR", section 3.1.
 DIELECTRIC_ALBEDO = (0.013, 0.871)
 METAL_ALBEDO = 0.40  # the darkest metals in use, sRGB 170; same source
+SOLID = 0.999  # a region of one may miss it by rounding where it was resampled
 NEITHER = (0.05, 0.95)  # metallic in between is a mixture that no material has
 
 Images = dict[str, Float[Tensor, "*shape"]]
@@ -101,10 +103,10 @@ def _operand(operand: str, channel: str, text: str) -> tuple[float, ...]:
         digits = operand[1:] if len(operand) == 7 else "".join(2 * d for d in operand[1:])
         srgb = torch.tensor([int(digits[i : i + 2], 16) / 255.0 for i in (0, 2, 4)])
         return tuple(linear_from_srgb(srgb.double()).tolist())
-    try:
-        numbers = tuple(float(part) for part in operand.split(","))
-    except ValueError:
-        numbers = ()
+    parts = operand.split(",")
+    # float() alone would also take 1_0, inf and digits of other scripts.
+    plain = all(NUMBER.fullmatch(part) for part in parts)
+    numbers = tuple(float(part) for part in parts) if plain else ()
     if len(numbers) not in (1, width) or not all(math.isfinite(n) for n in numbers):
         raise ValueError(
             f"wanted {'1 or 3 numbers' if width == 3 else 'a number'} for {channel}, "
@@ -113,46 +115,88 @@ def _operand(operand: str, channel: str, text: str) -> tuple[float, ...]:
     return numbers
 
 
+def scale_of(edits: Sequence[Edit], channel: str) -> tuple[float, ...] | None:
+    """The number (or three) that all edits of a channel together multiply it by.
+
+    None where they do more than that, or turn its sign.
+    """
+    scale = [1.0] * CHANNELS[channel]
+    for edit in edits:
+        if edit.channel != channel:
+            continue
+        if edit.operator not in "*/" or min(edit.operand) < 0.0:
+            return None
+        operand = edit.operand * (len(scale) // len(edit.operand))
+        inverse = edit.operator == "/"
+        scale = [s / o if inverse else s * o for s, o in zip(scale, operand, strict=True)]
+    return tuple(scale)
+
+
+def sets(edits: Sequence[Edit], channel: str) -> bool:
+    """Whether the channel ends up the same everywhere, whatever it was."""
+    return any(edit.channel == channel and edit.operator == "=" for edit in edits)
+
+
+def edit_channel(
+    channel: str,
+    values: Float[Tensor, "*shape C"],
+    edits: Sequence[Edit],
+    region: Float[Tensor, "*region 1"] | None = None,
+) -> tuple[Float[Tensor, "*shape C"], list[str]]:
+    """All edits of one channel, one after the other, clamped to [0, 1] once and blended once.
+
+    Clamping between them would make `*2` and then `*0.5` lose what lies above one half; blending
+    between them would take less than its share of a soft region.
+
+    Returns:
+        The new values, and a message that counts the clamped ones.
+    """
+    mine = [edit for edit in edits if edit.channel == channel]
+    wanted = values
+    for edit in mine:
+        wanted = edit.apply(wanted)
+    limited = wanted.clamp(0.0, 1.0)
+    outside = (wanted != limited).any(-1, keepdim=True)
+    if region is not None:
+        outside = outside & (region > 0.0)
+        # Exact at both ends: pixels outside the region keep their bits.
+        limited = torch.lerp(values, limited, region.expand_as(values))
+    count = int(outside.sum()) if mine else 0
+    texts = " ".join(str(edit) for edit in mine)
+    return limited, [f"{texts}: {count} pixels clamped to [0, 1]"] if count else []
+
+
 def apply_edits(
     images: Mapping[str, Float[Tensor, "*shape"]],
     edits: Sequence[Edit],
     region: Float[Tensor, "*region 1"] | None = None,
 ) -> tuple[Images, list[str]]:
-    """Apply edits one after the other and keep the result within what can be.
+    """Apply edits in order and keep the result within what can be; see `edit_channel`.
 
     Args:
         images: `basecolor`, `roughness`, `metallic`, channel last; others pass through.
         edits: in order.
-        region: share of the edit that each pixel takes, in [0, 1]; None edits everything.
+        region: share of the edits that each pixel takes, in [0, 1]; None edits everything.
 
     Returns:
-        All images, and messages: how many values were clamped to [0, 1], and what is implausible.
+        All images, and messages: how many values were clamped to [0, 1], and what the edits made
+        implausible.
 
     Raises:
         ValueError: the region is empty or of another size than the images.
     """
-    region = _checked(region, images["roughness"])
+    region = None if region is None else _checked(region, images["roughness"])
     edited, notices = dict(images), []
-    for edit in edits:
-        before = edited[edit.channel]
-        after = edit.apply(before)
-        limited = after.clamp(0.0, 1.0)
-        clamped = int(((after != limited) & (region > 0.0)).any(-1).sum())
-        if clamped:
-            notices.append(f"{edit}: {clamped} pixels clamped to [0, 1]")
-        edited[edit.channel] = before + region * (limited - before)
-    touched = {edit.channel for edit in edits}
-    if touched & {"basecolor", "metallic"}:
-        notices += _implausible(edited, region > 0.5)
-    return edited, notices
+    for channel in dict.fromkeys(edit.channel for edit in edits):
+        edited[channel], told = edit_channel(channel, images[channel], edits, region)
+        notices += told
+    return edited, notices + implausible(images, edited, region)
 
 
 def _checked(
-    region: Float[Tensor, "*region 1"] | None, like: Float[Tensor, "*shape 1"]
+    region: Float[Tensor, "*region 1"], like: Float[Tensor, "*shape 1"]
 ) -> Float[Tensor, "*shape 1"]:
-    """The region at the size of the images, everything where there is none."""
-    if region is None:
-        return torch.ones_like(like)
+    """The region at the size of the images."""
     if region.shape[-3:] != like.shape[-3:]:
         wanted, got = (f"{t.shape[-2]} x {t.shape[-3]}" for t in (like, region))
         raise ValueError(f"wanted a region of {wanted} pixels like the images, got {got}")
@@ -161,17 +205,33 @@ def _checked(
     return region.expand_as(like)
 
 
-def _implausible(images: Images, where: Tensor) -> list[str]:
-    """Messages about materials that do not exist; nothing is changed."""
+def implausible(
+    before: Mapping[str, Float[Tensor, "*shape"]],
+    after: Mapping[str, Float[Tensor, "*shape"]],
+    region: Float[Tensor, "*region 1"] | None = None,
+) -> list[str]:
+    """Messages about materials that do not exist and that the edit made; nothing is changed.
+
+    What was like that before is the asset's own, edges between metal and paint for instance, and
+    the soft border of a region mixes on purpose.
+    """
+    was, now = _oddities(before), _oddities(after)
+    made = {text: found & ~was[text] for text, found in now.items()}
+    if region is not None:
+        made = {text: found & (region > SOLID) for text, found in made.items()}
+    counts = {text: int(found.sum()) for text, found in made.items()}
+    return [f"implausible: {count} pixels {text}" for text, count in counts.items() if count]
+
+
+def _oddities(images: Mapping[str, Float[Tensor, "*shape"]]) -> dict[str, Tensor]:
+    """Where materials are of a kind that does not exist."""
     metallic = images["metallic"]
     bright = luminance(images["basecolor"])
     mixed = (metallic > NEITHER[0]) & (metallic < NEITHER[1])
     insulator, metal = metallic <= NEITHER[0], metallic >= NEITHER[1]
-    findings = {
+    return {
         "are neither metal nor insulator (metallic between 0 and 1)": mixed,
         "are brighter than any insulator": insulator & (bright > DIELECTRIC_ALBEDO[1]),
         "are darker than any insulator": insulator & (bright < DIELECTRIC_ALBEDO[0]),
         "are darker than any metal": metal & (bright < METAL_ALBEDO),
     }
-    counts = {text: int((found & where).sum()) for text, found in findings.items()}
-    return [f"implausible: {count} pixels {text}" for text, count in counts.items() if count]

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from svim3d.color import linear_from_srgb
-from svim3d.shading.material_edits import Edit, apply_edits
+from svim3d.shading.material_edits import Edit, apply_edits, scale_of
 
 ORANGE = tuple(linear_from_srgb(torch.tensor([0xAA, 0x33, 0x11]).double() / 255).tolist())
 
@@ -48,6 +48,8 @@ def test_edits_are_read(text, channel, operator, operand):
         ("rougness*2", "did you mean roughness"),
         ("normal=1", "wanted one of basecolor, roughness, metallic"),
         ("roughness=nan", "wanted a number for roughness"),
+        ("roughness=1_0", "wanted a number for roughness"),
+        ("roughness=inf", "wanted a number for roughness"),
         ("roughness=1e999", "wanted a number for roughness"),
         ("roughness=1,2,3", "wanted a number for roughness"),
         ("roughness=#fff", "wanted a colour like #aa3311 for basecolor"),
@@ -105,6 +107,43 @@ def test_soft_regions_blend():
     blend = 0.75 * before["basecolor"][0, 0, 1] + 0.25 * colour
     torch.testing.assert_close(after["basecolor"][0, 0, 1], blend)
     assert torch.equal(after["basecolor"][0, 1:], before["basecolor"][0, 1:])
+
+
+def test_several_edits_are_limited_and_blended_once():
+    before = images() | {"roughness": torch.full((1, 4, 4, 1), 0.8)}
+    doubled, notices = apply_edits(before, [Edit.parse("roughness*2"), Edit.parse("roughness*0.5")])
+    torch.testing.assert_close(doubled["roughness"], before["roughness"])
+    assert notices == []
+    edits = [Edit.parse("roughness=0.5"), Edit.parse("roughness*0.5")]
+    soft, _ = apply_edits(before, edits, torch.full((4, 4, 1), 0.5))
+    assert float(soft["roughness"].max()) == pytest.approx(0.5 * 0.8 + 0.5 * 0.25)
+
+
+def test_regions_keep_bits_where_they_are_zero_and_edit_fully_where_they_are_one():
+    before = images(64)
+    region = (torch.rand(64, 64, 1, generator=torch.Generator().manual_seed(1)) > 0.5).float()
+    everywhere, _ = apply_edits(before, [Edit.parse("basecolor*1.3")])
+    after, _ = apply_edits(before, [Edit.parse("basecolor*1.3")], region)
+    expected = torch.where(region > 0, everywhere["basecolor"], before["basecolor"])
+    assert torch.equal(after["basecolor"], expected)
+
+
+def test_what_was_implausible_before_is_not_the_edit_s_fault():
+    before = images() | {"metallic": torch.full((1, 4, 4, 1), 0.5)}
+    assert apply_edits(before, [Edit.parse("basecolor*0.9")])[1] == []
+
+
+@pytest.mark.parametrize(
+    ("texts", "scale"),
+    [
+        (["roughness*0.5", "metallic=1", "roughness/4"], (0.125,)),
+        (["metallic=1"], (1.0,)),
+        (["roughness*-1"], None),
+        (["roughness*0.5", "roughness+0.1"], None),
+    ],
+)
+def test_plain_scales_are_told_apart(texts, scale):
+    assert scale_of([Edit.parse(text) for text in texts], "roughness") == scale
 
 
 def test_regions_that_cannot_be_used_are_refused():
