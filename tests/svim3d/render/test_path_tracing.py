@@ -81,7 +81,7 @@ def bumps() -> torch.Tensor:
     [
         # Noise is 2 %; the rest is the split sum's, which is larger the rougher the metal.
         (SourceMaterial((0.9, 0.6, 0.3), 0.3, 1.0), 0.03),
-        (SourceMaterial(roughness_factor=0.6, metallic_factor=1.0, basecolor=checker()), 0.07),
+        (SourceMaterial(roughness_factor=0.6, metallic_factor=1.0, basecolor=checker()), 0.08),
         (SourceMaterial((0.7, 0.7, 0.7), 0.4, 1.0, normal_tangent=bumps()), 0.05),
         # Mitsuba's base receives what the layer above it reflects too: 7 % at this roughness.
         (SourceMaterial((0.5, 0.4, 0.3), 0.5, 0.0), 0.09),
