@@ -16,8 +16,13 @@ from stages.store import Store
 
 DONE, FAILED = 0, 1
 LIBRARIES = ("torch", "numpy", "numba", "OpenEXR", "pymeshlab", "xatlas", "prefect")
-# What the pipeline can do without; distribution and module names are the same.
-OPTIONAL = {"matplotlib": "charts of the benchmarks", "pytest": "the tests"}
+# What the pipeline can do without, by module name.
+OPTIONAL = {
+    "mitsuba": "svim3d relight --engine path",
+    "imageio_ffmpeg": "svim3d relight --turntable mp4, unless ffmpeg is on the path",
+    "matplotlib": "charts of the benchmarks",
+    "pytest": "the tests",
+}
 
 
 def doctor(root: Path) -> int:
