@@ -3,11 +3,12 @@
     python benchmarks/bench_path.py --data FOLDER [--assets cat boombox] [--views 0 3]
         [--samples 256] [--size 128] [--picture FILE]
 
-`--data` (default: the environment variable SVIM3D_DATA) holds `glb/*.glb` and `orbits/<asset>` with
-path-traced views of the same assets (`test_B`, `test_C`) and the maps that lit them. Each GLB is put
-where the orbit's `source_to_world` says and seen by the test cameras, in three ways: `raster` (our
-rasteriser and split sum, multiple scattering off as in the truth; the baseline), and through Mitsuba
-`shadow` (direct light: paths of two vertices) and `full` (six vertices, as in the truth).
+`--data` (default: the environment variable SVIM3D_DATA) holds `glb/*.glb` and `orbits/<asset>`
+with path-traced views of the same assets (`test_B`, `test_C`) and the maps that lit them. Each GLB
+is put where the orbit's `source_to_world` says and seen by the test cameras, in three ways:
+`raster` (our rasteriser and split sum, multiple scattering off as in the truth; the baseline), and
+through Mitsuba `shadow` (direct light: paths of two vertices) and `full` (six, as in the truth).
+Tangents are computed anew, as the truth's renderer does, whatever the file says.
 
 Figures are PSNR after AgX on the mask (> 0.5), mean over views; the truth is averaged down to
 `--size`. `energy` is the mean radiance of each over that of the truth. Seconds are CPU, per view.
@@ -36,6 +37,7 @@ from svim3d.cameras import Cameras  # noqa: E402
 from svim3d.io.exr import read_rgb  # noqa: E402
 from svim3d.io.glb import read_mesh  # noqa: E402
 from svim3d.io.orbit import read_orbit  # noqa: E402
+from svim3d.mesh.frames import tangent_frames  # noqa: E402
 from svim3d.mesh.source_mesh import SourceMesh  # noqa: E402
 from svim3d.metrics import psnr  # noqa: E402
 from svim3d.numerics import normalize  # noqa: E402
@@ -85,15 +87,20 @@ class Case:
 
 
 def placed(mesh: SourceMesh, transform: list[list[float]]) -> SourceMesh:
-    """The mesh after a rotation, uniform scale and shift."""
+    """The mesh after a rotation, uniform scale and shift, with tangents of its own."""
     matrix = torch.tensor(transform)
-    turn = matrix[:3, :3]
-    tangents = torch.cat([normalize(mesh.tangents[:, :3] @ turn.T), mesh.tangents[:, 3:]], 1)
+    vertices = mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    normals = normalize(mesh.normals @ matrix[:3, :3].T)
+    frames = tangent_frames(vertices, mesh.faces, normals, mesh.uv)
+    source = frames.vertex_source.long()
     return replace(
         mesh,
-        vertices=mesh.vertices @ turn.T + matrix[:3, 3],
-        normals=normalize(mesh.normals @ turn.T),
-        tangents=tangents,
+        vertices=vertices[source],
+        normals=normals[source],
+        uv=mesh.uv[source],
+        colors=mesh.colors[source],
+        faces=frames.faces,
+        tangents=frames.tangents,
     )
 
 
