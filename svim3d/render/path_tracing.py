@@ -20,7 +20,7 @@ from torch import Tensor
 from svim3d.cameras import FAR, NEAR, Cameras
 from svim3d.mesh.source_mesh import SourceMaterial, SourceMesh
 from svim3d.raster.texture import sample_texture
-from svim3d.shading.directional_albedo import lookup_split_sum
+from svim3d.shading.directional_albedo import integrate_split_sum
 from svim3d.shading.metallic_roughness import DIELECTRIC_F0
 
 # The compiled variants need a recent LLVM, and an old one (14, 15) ends the whole process.
@@ -29,8 +29,8 @@ DIELECTRIC_SPECULAR = 0.5  # of `principled`: reflectance 0.04 at normal inciden
 # Share of even light that the white diffuse base of `principled` reflects, by powers of roughness:
 # Burley's lobe integrated over both directions; the first is (1 - 1/42)^2.
 DISNEY_ALBEDO = (0.95295, 0.10870, 0.00352)
-TABLE_SIZE = 65  # roughnesses; the share is smooth, linear steps err by less than 1e-4
-ANGLES = 256  # midpoints of the cosine in its mean
+TABLE_SIZE = 17  # roughnesses; the factor is smooth
+ANGLES = 24  # midpoints of the cosine in its mean; with the steps above, errors below 2e-4
 
 Mitsuba = Any  # the module has no types of its own
 
@@ -259,7 +259,7 @@ def _base_scale_table() -> Float[Tensor, "r"]:
     roughness = torch.linspace(0.0, 1.0, TABLE_SIZE)
     cosine = (torch.arange(ANGLES) + 0.5) / ANGLES
     grid = torch.cartesian_prod(roughness, cosine)
-    scale, bias = lookup_split_sum(grid[:, 1:], grid[:, :1])
+    scale, bias = integrate_split_sum(grid[:, 1:], grid[:, :1])
     reflected = 2.0 * grid[:, 1:] * (DIELECTRIC_F0 * scale + bias)
     left = 1.0 - reflected.view(TABLE_SIZE, ANGLES).mean(1)
     constant, linear, square = DISNEY_ALBEDO
