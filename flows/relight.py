@@ -98,8 +98,9 @@ def parse_turns(text: str) -> tuple[float, ...]:
     if len(numbers) == 1:
         return (numbers[0],)
     start, stop, step = numbers
-    # The slack lets 0:1:0.1 end before 1 in spite of rounding.
-    count = math.ceil((stop - start) / step - 1e-9) if step else 0
+    # The slack lets 0:1:0.1 end before 1 in spite of rounding; the bounds keep the count finite.
+    steps = (stop - start) / step if step else 0.0
+    count = math.ceil(min(max(steps, 0.0), 1e6) - 1e-9)
     if not 1 <= count <= MAX_TURNS:
         raise InputError(
             f"--rotate {text}: wanted 1 to {MAX_TURNS} turns, but from {start:g} to {stop:g} in "

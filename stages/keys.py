@@ -33,6 +33,8 @@ NUMERIC_LIBRARIES = (
     "pymeshlab",
     "fast-simplification",
 )
+# Optional, but what they do belongs to the key all the same.
+OPTIONAL_LIBRARIES = ("mitsuba", "drjit", "imageio-ffmpeg")
 SKIPPED_INPUT = "none"
 # Meshes that name further files beside them, which belong to the input as much as they do.
 REFERRING_SUFFIXES = frozenset({".obj", ".mtl", ".gltf"})
@@ -134,7 +136,16 @@ def _is_named(name: str, text: bytes) -> bool:
 
 def library_versions() -> dict[str, str]:
     """Versions of the numeric libraries, without the build suffix (`2.13.0+cpu` is `2.13.0`)."""
-    return {name: importlib.metadata.version(name).partition("+")[0] for name in NUMERIC_LIBRARIES}
+    names = (*NUMERIC_LIBRARIES, *filter(_is_installed, OPTIONAL_LIBRARIES))
+    return {name: importlib.metadata.version(name).partition("+")[0] for name in names}
+
+
+def _is_installed(library: str) -> bool:
+    try:
+        importlib.metadata.version(library)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
 
 
 def code_digests(module: str) -> dict[str, str]:

@@ -103,7 +103,7 @@ def _relight(source: Path, config: RelightConfig, ctx: Context) -> RelitViews:
     spun = subject.reference if subject.reference in chosen else chosen[0]
     turns = () if config.turntable == "none" else config.azimuths_deg
     light = _light(config, ctx)
-    paint = _Paint.of(subject, spun, config, ctx)
+    paint = _Paint.of(subject, subject.reference, config, ctx)
     lit = _lighting(subject, paint, light, config, ctx)
     files = paint.record()
     shown: dict[str, Tensor] = {}

@@ -64,7 +64,7 @@ def read_gltf(file: Path) -> SourceMesh:
         )
     try:
         return _Reader(document, binary, file.parent).mesh()
-    except (KeyError, IndexError, struct.error, TypeError) as error:
+    except (KeyError, IndexError, struct.error, TypeError, AttributeError) as error:
         raise ValueError(f"{file.name} is no valid glTF 2.0 file: {error!r}") from error
 
 

@@ -62,11 +62,11 @@ def edit_glb(
         ValueError: it is no GLB with materials, it is not self-contained, or a region is wanted
             that meets nothing or lacks texture coordinates.
     """
-    document = GlbDocument(content)
     try:
+        document = GlbDocument(content)
         notices = _edit_document(document, edits, mask_of)
         return document.pack(), notices
-    except (KeyError, IndexError, TypeError, struct.error) as error:
+    except (KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
         raise ValueError(f"the .glb is no valid glTF 2.0: {error!r}") from error
 
 

@@ -7,9 +7,10 @@ or not. Two layouts are read: `frames` with `reference` as an index (what `write
 the layout of benchmark sets: `train`, and `test` whose frames name one file per environment.
 """
 
+import contextlib
 import json
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -100,12 +101,14 @@ def read_orbit(
         ValueError: the folder cannot be used; the text says what was wanted, what came and what
             to do.
     """
-    index = _read_index(folder)
-    frames = _frames(folder, index, split)
-    cameras = _cameras(folder, index, frames)
+    with _telling_of(folder):
+        index = _read_index(folder)
+        frames = _frames(folder, index, split)
+        cameras = _cameras(folder, index, frames)
+        reference = _reference(index, len(frames), split)
     names = [frame["file"] for frame in frames]
     images = _read_views([folder / name for name in names], cameras, wanted)
-    return cameras, repair_images(images, names, notify), _reference(index, len(frames), split)
+    return cameras, repair_images(images, names, notify), reference
 
 
 def read_frame(
@@ -120,7 +123,8 @@ def read_frame(
         wanted: which images of `CHANNELS` are needed.
         notify: told (kind, message) of what was mended or assumed.
     """
-    listed = _listed_camera(file)
+    with _telling_of(file.parent):
+        listed = _listed_camera(file)
     if listed is None:
         planes = read_exr(file)
         height, width = next(iter(planes.values())).shape
@@ -129,6 +133,17 @@ def read_frame(
             notify("camera_assumed", f"{file.name} is in no {INDEX}: taken to be seen as told")
     images = _read_views([file], listed, wanted)
     return listed, repair_images(images, [file.name], notify)
+
+
+@contextlib.contextmanager
+def _telling_of(folder: Path) -> Iterator[None]:
+    """Name the index where its entries are of another kind than they should be."""
+    try:
+        yield
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise ValueError(
+            f"wanted an orbit's index near {folder}, cannot use it: {error!r}"
+        ) from error
 
 
 def _listed_camera(file: Path) -> Cameras | None:

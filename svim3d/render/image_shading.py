@@ -254,7 +254,9 @@ class Occluders:
         for rays, lobe in zip(every_ray, lobes, strict=True):
             every, free = lobe_light(rays, light, azimuth_deg=azimuth_deg)
             shares.append(torch.where(every > DARKEST, free / every.clamp_min(DARKEST), 1.0))
-            gains.append(lobe / every.clamp_min(DARKEST))
+            # A lobe returns no more than it gets; rays that miss a lamp which the lookup saw do not
+            # tell what it got.
+            gains.append((lobe / every.clamp_min(DARKEST)).clamp_max(1.0))
         shadowed = lobes[0] * shares[0] + lobes[1] * shares[1]
         bounced = [torch.zeros_like(lobe) for lobe in lobes]
         for _ in range(bounces):

@@ -30,7 +30,10 @@ def test_unreadable_turns_are_refused(text):
         parse_turns(text)
 
 
-@pytest.mark.parametrize(("text", "count"), [("0:360:0", 0), ("0:360:-1", 0), ("0:360:0.1", 3600)])
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [("0:360:0", 0), ("0:360:-1", 0), ("0:360:0.1", 3600), ("0:1e308:1e-10", 1000000)],
+)
 def test_no_turns_and_too_many_are_refused(text, count):
     with pytest.raises(InputError, match=f"there are {count}"):
         parse_turns(text)

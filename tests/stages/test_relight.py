@@ -340,6 +340,26 @@ def test_a_region_beside_the_object_is_refused(orbit, ctx, tmp_path):
         run(orbit, config=config, ctx=ctx)
 
 
+def test_a_region_belongs_to_the_reference_view_whatever_is_shown(orbit, ctx, tmp_path):
+    config = STILL.model_copy(
+        update={"edits": ("metallic=1",), "mask": disc(tmp_path, 16, (8, 8), 3.0), "views": (0, 3)}
+    )
+    with pytest.raises(InputError, match=r"by depth, and these views have none|add the channel"):
+        run(orbit, config=config, ctx=ctx)
+    relit = run(orbit, config=config.model_copy(update={"views": (3,)}), ctx=ctx)
+    camera = json.loads(relit.files["edits.json"])["camera"]
+    assert camera["c2w"] == sphere_cameras().c2w[3].tolist()
+
+
+@pytest.mark.parametrize(
+    "index", ['{"frames": ["a"]}', '{"camera": null, "frames": [{"file": "000.exr", "c2w": 1}]}']
+)
+def test_an_index_of_another_kind_is_refused(orbit, ctx, index):
+    (orbit / "orbit.json").write_text(index)
+    with pytest.raises(InputError, match=r"index near|wanted"):
+        run(orbit, config=STILL, ctx=ctx)
+
+
 def test_a_mask_without_edits_is_an_error():
     with pytest.raises(ValueError, match="give an edit too"):
         RelightConfig(mask=Path("region.png"))

@@ -237,3 +237,16 @@ def test_thin_coverage_is_shaded_as_in_open_air():
     thin = replace(gbuffer, mask=torch.where(gbuffer.mask > 0.0, 0.25, 0.0))
     shaded = shade_view(thin, 0, uniform_light(), visibility=ScreenVisibility.trace(thin, 0))
     assert torch.equal(shaded.radiance, shade_view(gbuffer, 0, uniform_light()).radiance)
+
+
+def test_a_single_lamp_never_brings_more_light_than_open_air_lets_in():
+    # Rays that miss a lamp which the prefiltered lookup saw must not turn bounces into fireflies.
+    radiance = torch.zeros(LIGHT_SIZE, LIGHT_SIZE, 3)
+    radiance[4, 20] = 500.0
+    pyramid = PyramidOperator.build(LIGHT_SIZE, "exact")(radiance)
+    gbuffer = ball_on_ground(camera(SIZE), roughness=0.2, basecolor=0.9)
+    points = ViewPoints.of(gbuffer, 0, ScreenVisibility.trace(gbuffer, 0))
+    occluded = points.lit(pyramid).radiance
+    open_air = ViewPoints.of(gbuffer, 0).lit(pyramid).radiance
+    assert float(occluded.max()) < 1.5 * float(open_air.max())
+    assert float(occluded.mean()) < float(open_air.mean())
