@@ -239,14 +239,14 @@ def test_thin_coverage_is_shaded_as_in_open_air():
     assert torch.equal(shaded.radiance, shade_view(gbuffer, 0, uniform_light()).radiance)
 
 
-def test_a_single_lamp_never_brings_more_light_than_open_air_lets_in():
-    # Rays that miss a lamp which the prefiltered lookup saw must not turn bounces into fireflies.
+@pytest.mark.parametrize("lamp_texel", [(3, 5), (10, 18), (17, 31), (24, 12)])
+def test_a_single_lamp_makes_no_fireflies(lamp_texel):
+    # Rays that miss a lamp which the prefiltered lookup saw must not turn bounces into more light
+    # than there is anywhere in open air: unbounded, some came out 700,000 times as bright.
     radiance = torch.zeros(LIGHT_SIZE, LIGHT_SIZE, 3)
-    radiance[4, 20] = 500.0
+    radiance[lamp_texel] = 500.0
     pyramid = PyramidOperator.build(LIGHT_SIZE, "exact")(radiance)
-    gbuffer = ball_on_ground(camera(SIZE), roughness=0.2, basecolor=0.9)
-    points = ViewPoints.of(gbuffer, 0, ScreenVisibility.trace(gbuffer, 0))
-    occluded = points.lit(pyramid).radiance
-    open_air = ViewPoints.of(gbuffer, 0).lit(pyramid).radiance
-    assert float(occluded.max()) < 1.5 * float(open_air.max())
-    assert float(occluded.mean()) < float(open_air.mean())
+    gbuffer = ball_on_ground(camera(SIZE), roughness=0.3, basecolor=0.9, metallic=1.0)
+    visibility = ScreenVisibility.trace(gbuffer, 0)
+    occluded = shade_view(gbuffer, 0, pyramid, visibility=visibility).radiance
+    assert float(occluded.max()) < 1.2 * float(shade_view(gbuffer, 0, pyramid).radiance.max())
