@@ -17,12 +17,12 @@ from flows.job import Job, compute_here, compute_under_engine
 from flows.pipeline import RELIGHT
 from flows.plan import Selection, make_plan
 from stages.errors import InputError
+from stages.settings.relight import MAX_FRAMES
 
 ORBIT_INDEX, ASSET = "orbit.json", "asset.glb"
 INSIDE = ("", "files")  # a folder itself, and the payload of a store's artifact
 BUILT_IN_LIGHT = "studio"
 SCATTERING: dict[str, bool | str] = {"on": True, "off": False, "scaled": "scaled"}
-MAX_TURNS = 1440  # of one animation
 
 
 def relight(options: argparse.Namespace) -> int:
@@ -101,9 +101,9 @@ def parse_turns(text: str) -> tuple[float, ...]:
     # The slack lets 0:1:0.1 end before 1 in spite of rounding; the bounds keep the count finite.
     steps = (stop - start) / step if step else 0.0
     count = math.ceil(min(max(steps, 0.0), 1e6) - 1e-9)
-    if not 1 <= count <= MAX_TURNS:
+    if not 1 <= count <= MAX_FRAMES:
         raise InputError(
-            f"--rotate {text}: wanted 1 to {MAX_TURNS} turns, but from {start:g} to {stop:g} in "
+            f"--rotate {text}: wanted 1 to {MAX_FRAMES} turns, but from {start:g} to {stop:g} in "
             f"steps of {step:g} there are {max(count, 0)}"
         )
     return tuple(start + index * step for index in range(count))

@@ -17,18 +17,15 @@ from stages.errors import InputError
 from stages.prefilter_cache import cached_operator
 from stages.settings.generation import GenerationConfig
 from svim3d.cameras import fitting_radius, orbit_angles, orbit_cameras
-from svim3d.io.glb import read_mesh
 from svim3d.io.light import read_light
 from svim3d.io.orbit import read_orbit
 from svim3d.io.orbit_repair import admit_views
-from svim3d.io.scene import read_scene
+from svim3d.io.scene import read_object
 from svim3d.mesh.source_mesh import SourceMesh, normalised
 from svim3d.render.deferred import environment_shader
 from svim3d.render.pictures import render_pictures
 from svim3d.shading.octahedral import texel_directions
 from svim3d.shading.studio import studio_radiance
-
-SCENE_SUFFIX = ".json"
 
 
 def run(source: Path, *, config: GenerationConfig, ctx: Context) -> MaterialViews:
@@ -45,8 +42,7 @@ def run(source: Path, *, config: GenerationConfig, ctx: Context) -> MaterialView
     try:
         if source.is_dir():
             return _from_orbit(source, ctx)
-        mesh = read_scene(source) if source.suffix.lower() == SCENE_SUFFIX else read_mesh(source)
-        return _from_mesh(normalised(mesh, source.name), config, ctx)
+        return _from_mesh(normalised(read_object(source), source.name), config, ctx)
     except InputError:
         raise
     except ValueError as error:

@@ -103,7 +103,7 @@ def _relight(source: Path, config: RelightConfig, ctx: Context) -> RelitViews:
     spun = subject.reference if subject.reference in chosen else chosen[0]
     turns = () if config.turntable == "none" else config.azimuths_deg
     light = _light(config, ctx)
-    paint = _Paint.of(subject, subject.reference, config, ctx)
+    paint = _Paint.of(subject, config, ctx)
     lit = _lighting(subject, paint, light, config, ctx)
     files = paint.record()
     shown: dict[str, Tensor] = {}
@@ -164,62 +164,77 @@ def _light(config: RelightConfig, ctx: Context) -> Float[Tensor, "N N 3"]:
 
 
 @dataclass(frozen=True)
+class _Region:
+    """A region drawn on one view.
+
+    Attributes:
+        home: that view.
+        share: of the edits that each of its pixels takes.
+    """
+
+    home: GBuffer
+    share: Float[Tensor, "H W 1"]
+
+    @classmethod
+    def drawn_on(cls, home: GBuffer, file: Path) -> Self:
+        """Read a region from a picture of the view."""
+        share = resized_region(read_region(file), *home.mask.shape[1:3])
+        if not bool(((share > 0.0) & (home.mask[0] > 0.0)).any()):
+            raise InputError(f"the region in {file.name} is empty: it misses the object")
+        return cls(home, share)
+
+    def seen_in(self, gbuffer: GBuffer) -> Float[Tensor, "1 H W 1"]:
+        """The region as another view, or the same, sees it."""
+        if torch.equal(gbuffer.cameras.c2w, self.home.cameras.c2w):
+            return self.share[None]
+        points = gbuffer.positions(0).view(-1, 3)
+        return region_of_points(points, self.share, self.home).view_as(gbuffer.mask)
+
+
+@dataclass(frozen=True)
 class _Paint:
     """What is changed about the materials, and where.
 
     Attributes:
         edits: in order.
-        home: the view that the region was drawn on; None where there is no region.
-        region: at the size of `home`.
+        region: None edits everything.
         tell: told of clamped and implausible values.
     """
 
     edits: tuple[Edit, ...]
-    home: GBuffer | None
-    region: Float[Tensor, "H W 1"] | None
+    region: _Region | None
     tell: Callable[[str, str], None]
 
     @classmethod
-    def of(cls, subject: Subject, drawn_on: int, config: RelightConfig, ctx: Context) -> Self:
-        """Read the edits; a region is taken to be drawn on the view `drawn_on`."""
+    def of(cls, subject: Subject, config: RelightConfig, ctx: Context) -> Self:
+        """Read the edits; a region is taken to be drawn on the reference view."""
         edits = tuple(Edit.parse(text) for text in config.edits)
         if config.mask is None:
-            return cls(edits, None, None, ctx.event)
-        home = subject.view(drawn_on)
-        region = resized_region(read_region(config.mask), *home.mask.shape[1:3])
-        if not bool(((region > 0.0) & (home.mask[0] > 0.0)).any()):
-            raise InputError(f"the region in {config.mask.name} is empty: it misses the object")
-        return cls(edits, home, region, ctx.event)
+            return cls(edits, None, ctx.event)
+        home = subject.view(subject.reference)
+        return cls(edits, _Region.drawn_on(home, config.mask), ctx.event)
 
     def __call__(self, gbuffer: GBuffer, index: int) -> GBuffer:
         """The same view in other paint."""
         if not self.edits:
             return gbuffer
-        region = (gbuffer.mask > 0.0).float()
-        if self.region is not None and self.home is not None:
-            region = region * self._region_in(gbuffer)
-        if not bool((region > 0.0).any()):  # the region lies on a side that this view does not see
+        share = (gbuffer.mask > 0.0).float()
+        if self.region is not None:
+            share = share * self.region.seen_in(gbuffer)
+        if not bool((share > 0.0).any()):  # the region lies on a side that this view does not see
             return gbuffer
-        images, notices = apply_edits(gbuffer.images(), self.edits, region)
+        images, notices = apply_edits(gbuffer.images(), self.edits, share)
         for notice in notices:
             self.tell("edit", f"view {index}: {notice}")
         return GBuffer.of(gbuffer.cameras, images)
-
-    def _region_in(self, gbuffer: GBuffer) -> Float[Tensor, "1 H W 1"]:
-        """The region as another view, or the same, sees it."""
-        if self.home is None or self.region is None:
-            raise ValueError("there is no region")
-        if torch.equal(gbuffer.cameras.c2w, self.home.cameras.c2w):
-            return self.region[None]
-        points = gbuffer.positions(0).view(-1, 3)
-        return region_of_points(points, self.region, self.home).view_as(gbuffer.mask)
 
     def record(self) -> dict[str, bytes]:
         """Files from which the edits can be replayed on the asset's textures."""
         if not self.edits:
             return {}
-        camera = None if self.home is None else self.home.cameras
-        return EditRecord(self.edits, self.region, camera).files()
+        if self.region is None:
+            return EditRecord(self.edits).files()
+        return EditRecord(self.edits, self.region.share, self.region.home.cameras).files()
 
 
 def _lighting(

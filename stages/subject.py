@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Protocol
 
 from svim3d.cameras import Cameras, fitting_radius, look_at_origin, orbit_angles, orbit_cameras
-from svim3d.io.glb import read_mesh
 from svim3d.io.orbit import read_frame, read_orbit
-from svim3d.io.scene import read_scene
+from svim3d.io.scene import read_object
 from svim3d.mesh.source_mesh import SourceMesh, normalised
 from svim3d.render.gbuffer import GBuffer
 from svim3d.render.pictures import render_gbuffer
 
-FRAME_SUFFIX, SCENE_SUFFIX = ".exr", ".json"
+FRAME_SUFFIX = ".exr"
 BUFFERS = ("mask", "basecolor", "roughness", "metallic", "normal_world")  # what shading needs
 ASSET_FILL = 0.85  # share of the picture's height that an asset's bounding sphere takes
 FRAME_RADIUS = 2.0  # distance of a frame's camera that no orbit tells; shading does not ask it
@@ -113,14 +112,12 @@ def read_subject(source: Path, at: Viewpoint, notify: Callable[[str, str], None]
     if source.is_dir():
         cameras, images, reference = read_orbit(source, wanted=BUFFERS, notify=notify)
         return PictureSubject(GBuffer.of(cameras, images), reference)
-    suffix = source.suffix.lower()
-    if suffix == FRAME_SUFFIX:
+    if source.suffix.lower() == FRAME_SUFFIX:
         pose = look_at_origin(at.elevation_deg, 0.0, FRAME_RADIUS)
         assumed = Cameras(pose[None], at.fov_y_deg, at.size, at.size)
         cameras, images = read_frame(source, assumed, wanted=BUFFERS, notify=notify)
         return PictureSubject(GBuffer.of(cameras, images), 0)
-    mesh = read_scene(source) if suffix == SCENE_SUFFIX else read_mesh(source)
-    mesh = normalised(mesh, source.name)
+    mesh = normalised(read_object(source), source.name)
     cameras = orbit_cameras(
         orbit_angles(at.views, at.elevation_deg, 0.0),
         radius=fitting_radius(mesh.vertices, at.fov_y_deg, ASSET_FILL),

@@ -7,8 +7,6 @@ other libraries.
 """
 
 import io
-import json
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,14 +19,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from svim3d.color import linear_from_srgb
-from svim3d.io.gltf import BINARY_CHUNK, GLB_MAGIC, JSON_CHUNK, read_gltf
+from svim3d.io.gltf import ALIGNMENT, pack_glb, read_gltf
 from svim3d.io.image import encode_png
 from svim3d.io.obj import read_obj
 from svim3d.mesh.source_mesh import SourceMesh
 from svim3d.numerics import normalize
 
-GLTF_VERSION = 2
-ALIGNMENT = 4  # chunks and accessors start on multiples of their component size
 UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5123, 5125, 5126
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
 LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
@@ -246,8 +242,4 @@ class _Parts:
         full |= {kind: entries for kind, entries in self._lists.items() if entries}
         binary = bytes(self._content) + b"\0" * (-len(self._content) % ALIGNMENT)
         full["buffers"] = [{"byteLength": len(binary)}]
-        text = json.dumps(full, separators=(",", ":")).encode()
-        text += b" " * (-len(text) % ALIGNMENT)
-        body = struct.pack("<I", len(text)) + JSON_CHUNK + text
-        body += struct.pack("<I", len(binary)) + BINARY_CHUNK + binary
-        return GLB_MAGIC + struct.pack("<II", GLTF_VERSION, 12 + len(body)) + body
+        return pack_glb(full, binary)

@@ -26,6 +26,8 @@ Json = dict[str, Any]
 
 GLB_MAGIC = b"glTF"
 JSON_CHUNK, BINARY_CHUNK = b"JSON", b"BIN\0"
+GLTF_VERSION = 2
+ALIGNMENT = 4  # chunks and accessors start on multiples of their component size
 COMPONENTS: dict[int, type[np.generic]] = {
     5120: np.int8,
     5121: np.uint8,
@@ -88,6 +90,17 @@ def _read_container(file: Path) -> tuple[Json, bytes]:
     if JSON_CHUNK not in chunks:
         raise ValueError(f"{file.name} is a GLB without a JSON chunk")
     return json.loads(chunks[JSON_CHUNK]), chunks.get(BINARY_CHUNK, b"")
+
+
+def pack_glb(document: Json, binary: bytes) -> bytes:
+    """A GLB of a JSON document and, unless it is empty, the file's own buffer."""
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % ALIGNMENT)
+    body = struct.pack("<I", len(text)) + JSON_CHUNK + text
+    if binary:
+        binary += b"\0" * (-len(binary) % ALIGNMENT)
+        body += struct.pack("<I", len(binary)) + BINARY_CHUNK + binary
+    return GLB_MAGIC + struct.pack("<II", GLTF_VERSION, 12 + len(body)) + body
 
 
 class _Reader:

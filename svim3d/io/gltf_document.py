@@ -13,12 +13,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from svim3d.io.gltf import BINARY_CHUNK, GLB_MAGIC, JSON_CHUNK
+from svim3d.io.gltf import ALIGNMENT, BINARY_CHUNK, GLB_MAGIC, JSON_CHUNK, pack_glb
 from svim3d.io.image import decode_image
 
 Json = dict[str, Any]
 
-ALIGNMENT = 4  # of chunks, and of buffer views with any component type
 # Extensions of the whole file that name no textures; beside others, old images are kept.
 HARMLESS = {"KHR_materials_variants", "KHR_lights_punctual"}
 WEBP = "EXT_texture_webp"
@@ -104,13 +103,7 @@ class GlbDocument:
         if self._views != self._untouched:
             binary = self._laid_out()
             self.json.setdefault("buffers", [{}])[0]["byteLength"] = len(binary)
-        text = json.dumps(self.json, separators=(",", ":")).encode()
-        text += b" " * (-len(text) % ALIGNMENT)
-        body = struct.pack("<I", len(text)) + JSON_CHUNK + text
-        if binary:
-            binary += b"\0" * (-len(binary) % ALIGNMENT)
-            body += struct.pack("<I", len(binary)) + BINARY_CHUNK + binary
-        return GLB_MAGIC + struct.pack("<II", 2, 12 + len(body)) + body
+        return pack_glb(self.json, binary)
 
     def _laid_out(self) -> bytes:
         """All buffer views one after the other."""

@@ -20,10 +20,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from svim3d.io.glb import read_mesh
 from svim3d.mesh.lathe import Body, revolve, sweep
 from svim3d.mesh.source_mesh import SourceMaterial, SourceMesh, merge
 from svim3d.numerics import smoothstep
 
+SCENE_SUFFIX = ".json"
 SMOOTHING_ROUNDS = 4
 LATHE_SEGMENTS, TUBE_SEGMENTS = 128, 32
 TEXTURE_HEIGHT, TEXTURE_WIDTH = 1024, 1024
@@ -51,6 +53,15 @@ def read_scene(file: Path) -> SourceMesh:
             "of the wrong kind; see configs/example.json"
         ) from error
     return merge([_source_mesh(body, i, textures) for i, body in enumerate(bodies)])
+
+
+def read_object(file: Path) -> SourceMesh:
+    """Read a scene file (.json) or a mesh file.
+
+    Raises:
+        ValueError: see `read_scene` and `read_mesh`.
+    """
+    return read_scene(file) if file.suffix.lower() == SCENE_SUFFIX else read_mesh(file)
 
 
 def _body(part: dict[str, Any]) -> Body:
