@@ -75,6 +75,8 @@ DOORS = {
     "numba": ("svim3d",),
     "scipy": ("svim3d",),
     "kornia": ("svim3d",),
+    "diffusers": ("svim3d.diffusion",),
+    "transformers": ("svim3d.diffusion",),
     "torch": ("svim3d", "stages", "flows"),
     "numpy": ("svim3d", "stages"),
     "jaxtyping": ("svim3d", "stages"),

@@ -1,0 +1,86 @@
+"""What the generator is told: the reference view as a token and as a latent, and all cameras."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+from transformers import CLIPVisionModelWithProjection
+
+# Mean and standard deviation of the pictures that CLIP was trained on, display-referred RGB.
+CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
+CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """What the network is told beside the noisy latents.
+
+    Attributes:
+        token: the reference view as a whole.
+        latent: the reference view's latent, not scaled as the noisy latents are.
+        camera: of each frame, see `camera_numbers`.
+    """
+
+    token: Float[Tensor, "b 1 d"]
+    latent: Float[Tensor, "b z h w"]
+    camera: Float[Tensor, "b k 3"]
+
+    def dropped(self, drop: Float[Tensor, "b"]) -> Self:
+        """Without the reference view where `drop` is 1; the cameras stay."""
+        keep = 1.0 - drop
+        return type(self)(
+            token=self.token * keep.view(-1, 1, 1).to(self.token),
+            latent=self.latent * keep.view(-1, 1, 1, 1).to(self.latent),
+            camera=self.camera,
+        )
+
+    def beside_unconditional(self) -> Self:
+        """A batch twice as long: first without the reference view, then with it."""
+        nothing = self.dropped(torch.ones(len(self.token), device=self.token.device))
+        return type(self)(
+            token=torch.cat([nothing.token, self.token]),
+            latent=torch.cat([nothing.latent, self.latent]),
+            camera=torch.cat([self.camera, self.camera]),
+        )
+
+    def beside(self, noisy: Float[Tensor, "b k c h w"]) -> Float[Tensor, "b k c_and_z h w"]:
+        """The network's picture input: noisy latents, and the reference view's beside each."""
+        frames = noisy.shape[1]
+        latent = self.latent[:, None].expand(-1, frames, -1, -1, -1).to(noisy)
+        return torch.cat([noisy, latent], 2)
+
+
+def camera_numbers(
+    elevation_deg: Float[Tensor, "*b k"], azimuth_deg: Float[Tensor, "*b k"], added_noise: float
+) -> Float[Tensor, "*b k 3"]:
+    """Per frame: noise added to the reference view, polar angle and azimuth in radians.
+
+    The elevation is absolute; the azimuth counts from the reference view, which is the last frame,
+    and lies in [0, 2 pi). Source: SV3D's sampling script.
+    """
+    turned = (azimuth_deg - azimuth_deg[..., -1:]).remainder(360.0)
+    polar = torch.deg2rad(90.0 - elevation_deg)
+    return torch.stack([torch.full_like(polar, added_noise), polar, torch.deg2rad(turned)], -1)
+
+
+def embed_picture(
+    encoder: CLIPVisionModelWithProjection, picture: Float[Tensor, "b 3 H W"]
+) -> Float[Tensor, "b 1 d"]:
+    """The reference view's token: CLIP's pooled and projected answer.
+
+    Args:
+        encoder: a CLIP image tower of any size.
+        picture: display-referred, in [-1, 1].
+    """
+    side = encoder.config.image_size
+    resized = functional.interpolate(
+        picture.float(), size=(side, side), mode="bicubic", align_corners=False, antialias=True
+    )
+    mean = resized.new_tensor(CLIP_MEAN).view(1, 3, 1, 1)
+    std = resized.new_tensor(CLIP_STD).view(1, 3, 1, 1)
+    pixels = ((resized + 1.0) / 2.0 - mean) / std
+    embedded: Tensor = encoder(pixel_values=pixels.to(encoder.dtype)).image_embeds
+    return embedded[:, None]

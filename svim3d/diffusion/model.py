@@ -1,0 +1,278 @@
+"""The generator as a whole: one picture and a list of cameras in, views with materials out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from diffusers import AutoencoderKL
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+
+from svim3d.diffusion.autoencoder import decode, encode
+from svim3d.diffusion.conditioning import Conditioning, camera_numbers, embed_picture
+from svim3d.diffusion.groups import GROUPS, GeneratedViews, as_network_input, unpack
+from svim3d.diffusion.guidance import (
+    GuidanceInterval,
+    guide,
+    weights_by_azimuth,
+    weights_by_index,
+)
+from svim3d.diffusion.karras import c_in, c_noise, denoised, noise_levels
+from svim3d.diffusion.sampler import sample, seeded_noise
+from svim3d.diffusion.unet import MaterialVideoUNet
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """Everything about a model that is not a weight.
+
+    Attributes:
+        name: what its card calls it.
+        image_size: side of its pictures, pixels.
+        views: frames of a clip.
+        fov_deg: vertical field of view of all cameras.
+        groups: order of the pictures' channels in a latent.
+        latent_scale: brings the autoencoder's latents to unit variance.
+        sigma_min: smallest noise level of a sampler, before 0.
+        sigma_max: largest.
+        rho: how unevenly levels are spread.
+        steps: of the sampler, unless asked for others.
+        guidance_min: strength at the reference view.
+        guidance_max: strength behind.
+        cond_aug: noise that the network believes to be on the reference view.
+        transfer: how RGB is encoded for display.
+        unet: arguments of `MaterialVideoUNet`.
+        autoencoder: arguments of diffusers' `AutoencoderKL`.
+        image_encoder: arguments of transformers' `CLIPVisionConfig`.
+    """
+
+    name: str
+    image_size: int
+    views: int
+    fov_deg: float
+    latent_scale: float
+    sigma_max: float
+    steps: int
+    guidance_max: float
+    unet: dict[str, Any]
+    autoencoder: dict[str, Any]
+    image_encoder: dict[str, Any]
+    guidance_min: float = 1.0
+    sigma_min: float = 0.002
+    rho: float = 7.0
+    cond_aug: float = 1e-5
+    transfer: Literal["srgb"] = "srgb"
+    groups: tuple[str, ...] = field(default=GROUPS)
+
+    @property
+    def latent_side(self) -> int:
+        """Side of a latent picture."""
+        halvings = len(self.autoencoder["block_out_channels"]) - 1
+        return int(self.image_size // 2**halvings)
+
+    @property
+    def latent_channels(self) -> int:
+        """Channels of one group's latent."""
+        return int(self.autoencoder["latent_channels"])
+
+
+# SV3D_p with four groups. Source: SV3D's configuration files; SViM3D, section 4.
+PAPER = ModelSpec(
+    name="svim3d-576",
+    image_size=576,
+    views=21,
+    fov_deg=33.8,
+    latent_scale=0.18215,
+    sigma_max=700.0,
+    steps=50,
+    guidance_max=2.5,
+    unet={
+        "in_channels": 20,
+        "out_channels": 16,
+        "block_out_channels": [320, 640, 1280, 1280],
+        "num_attention_heads": [5, 10, 20, 20],
+        "layers_per_block": 2,
+        "cross_attention_dim": 1024,
+        "addition_time_embed_dim": 256,
+        "attention": [True, True, True, False],
+    },
+    autoencoder={
+        "block_out_channels": [128, 256, 512, 512],
+        "down_block_types": ["DownEncoderBlock2D"] * 4,
+        "up_block_types": ["UpDecoderBlock2D"] * 4,
+        "latent_channels": 4,
+        "layers_per_block": 2,
+        "sample_size": 576,
+    },
+    image_encoder={
+        "hidden_size": 1280,
+        "intermediate_size": 5120,
+        "num_hidden_layers": 32,
+        "num_attention_heads": 16,
+        "projection_dim": 1024,
+        "image_size": 224,
+        "patch_size": 14,
+        "hidden_act": "gelu",
+    },
+)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How an orbit is drawn.
+
+    Attributes:
+        steps: of the sampler; None takes the model's own.
+        guidance_max: strength of guidance behind the object; None takes the model's own.
+        guidance_by: how guidance grows: with the frame's index, or with its azimuth.
+        interval: noise levels at which guidance acts.
+        decode_at_once: pictures that the autoencoder decodes together.
+    """
+
+    steps: int | None = None
+    guidance_max: float | None = None
+    guidance_by: Literal["index", "azimuth"] = "index"
+    interval: GuidanceInterval = field(default_factory=GuidanceInterval)
+    decode_at_once: int = 21
+
+
+class MaterialDiffusion:
+    """UNet, autoencoder and image encoder, and how to draw an orbit with them.
+
+    Args:
+        spec: what the weights are for.
+        unet: sees frames together.
+        autoencoder: sees one picture of one group at a time.
+        image_encoder: sees the reference view.
+    """
+
+    def __init__(
+        self,
+        spec: ModelSpec,
+        unet: MaterialVideoUNet,
+        autoencoder: AutoencoderKL,
+        image_encoder: CLIPVisionModelWithProjection,
+    ) -> None:
+        self.spec = spec
+        self.unet = unet
+        self.autoencoder = autoencoder
+        self.image_encoder = image_encoder
+
+    @classmethod
+    def untrained(cls, spec: ModelSpec) -> "MaterialDiffusion":
+        """With random weights, on torch's current default device."""
+        return cls(
+            spec,
+            MaterialVideoUNet(**spec.unet),
+            AutoencoderKL(**spec.autoencoder),
+            CLIPVisionModelWithProjection(CLIPVisionConfig(**spec.image_encoder)),
+        )
+
+    @property
+    def parts(self) -> dict[str, torch.nn.Module]:
+        """The networks by the names of their files."""
+        return {
+            "unet": self.unet,
+            "autoencoder": self.autoencoder,
+            "image_encoder": self.image_encoder,
+        }
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.unet.conv_in.weight.device
+
+    @torch.no_grad()
+    def condition(
+        self,
+        picture: Float[Tensor, "H W 3"],
+        elevation_deg: Float[Tensor, "K"],
+        azimuth_deg: Float[Tensor, "K"],
+    ) -> Conditioning:
+        """What the network is told of a picture and of cameras.
+
+        Args:
+            picture: the reference view over white, display-referred, in [0, 1], square.
+            elevation_deg: absolute, of each frame.
+            azimuth_deg: of each frame; the last frame is the reference view.
+        """
+        side = self.spec.image_size
+        pictures = as_network_input(picture[None]).to(self.device, torch.float32)
+        if pictures.shape[-1] != side:
+            pictures = functional.interpolate(
+                pictures, size=(side, side), mode="bicubic", align_corners=False, antialias=True
+            ).clamp(-1.0, 1.0)
+        camera = camera_numbers(elevation_deg, azimuth_deg, self.spec.cond_aug)
+        return Conditioning(
+            token=embed_picture(self.image_encoder, pictures).float(),
+            latent=encode(self.autoencoder, pictures),
+            camera=camera[None].to(self.device, torch.float32),
+        )
+
+    @torch.no_grad()
+    def draw(
+        self,
+        conditioning: Conditioning,
+        seed: int,
+        sampling: Sampling = Sampling(),
+        report: Callable[[int, int], None] | None = None,
+    ) -> Float[Tensor, "K c h w"]:
+        """Latents of one orbit, all groups, of unit variance; same seed, same orbit."""
+        spec, frames = self.spec, conditioning.camera.shape[1]
+        side, channels = spec.latent_side, spec.latent_channels * len(spec.groups)
+        noise = seeded_noise((1, frames, channels, side, side), seed, device=self.device)
+        sigmas = noise_levels(
+            sampling.steps or spec.steps,
+            sigma_min=spec.sigma_min,
+            sigma_max=spec.sigma_max,
+            rho=spec.rho,
+        )
+        weights = self._guidance(conditioning, sampling)
+        both = conditioning.beside_unconditional()
+
+        def denoise(state: Tensor, sigma: float) -> Tensor:
+            guided = sampling.interval.holds(sigma) and bool((weights != 1.0).any())
+            if not guided:
+                return self.denoise(state, sigma, conditioning)
+            without, given = self.denoise(torch.cat([state, state]), sigma, both).chunk(2)
+            return guide(without, given, weights)
+
+        return sample(denoise, noise, sigmas, report)[0]
+
+    def denoise(
+        self, noisy: Float[Tensor, "b k c h w"], sigma: float, conditioning: Conditioning
+    ) -> Float[Tensor, "b k c h w"]:
+        """The clean latents that the network expects behind noisy ones."""
+        level = torch.full((len(noisy),), sigma, dtype=noisy.dtype, device=noisy.device)
+        weights = self.unet.conv_in.weight.dtype
+        answer = self.unet(
+            conditioning.beside(noisy * float(c_in(level[:1]))).to(weights),
+            c_noise(level).to(torch.float32),
+            conditioning.token.to(weights),
+            conditioning.camera,
+        )
+        return denoised(noisy, answer.to(noisy.dtype), level)
+
+    @torch.no_grad()
+    def decode(
+        self,
+        latents: Float[Tensor, "K c h w"],
+        sampling: Sampling = Sampling(),
+    ) -> GeneratedViews:
+        """The views that latents of unit variance stand for."""
+        groups = latents.split(self.spec.latent_channels, 1)
+        stacked = torch.cat(groups) / self.spec.latent_scale
+        pictures = decode(self.autoencoder, stacked, sampling.decode_at_once).chunk(len(groups))
+        return unpack(dict(zip(self.spec.groups, pictures, strict=True)))
+
+    def _guidance(self, conditioning: Conditioning, sampling: Sampling) -> Float[Tensor, "K"]:
+        strongest = sampling.guidance_max
+        strongest = self.spec.guidance_max if strongest is None else strongest
+        strength = {"weakest": self.spec.guidance_min, "strongest": strongest}
+        camera = conditioning.camera[0]
+        if sampling.guidance_by == "index":
+            return weights_by_index(len(camera), **strength)
+        return weights_by_azimuth(torch.rad2deg(camera[:, 2]).cpu(), **strength)
