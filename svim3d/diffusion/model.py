@@ -1,7 +1,7 @@
 """The generator as a whole: one picture and a list of cameras in, views with materials out."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
@@ -170,6 +170,11 @@ class MaterialDiffusion:
             AutoencoderKL(**spec.autoencoder),
             CLIPVisionModelWithProjection(CLIPVisionConfig(**spec.image_encoder)),
         )
+
+    def with_latent_scale(self, scale: float) -> "MaterialDiffusion":
+        """The same networks with latents scaled differently."""
+        spec = replace(self.spec, latent_scale=scale)
+        return MaterialDiffusion(spec, self.unet, self.autoencoder, self.image_encoder)
 
     @property
     def parts(self) -> dict[str, torch.nn.Module]:

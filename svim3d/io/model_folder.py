@@ -29,13 +29,13 @@ def write_model(
     (folder / CARD).write_text(card)
 
 
-def read_spec(folder: Path) -> ModelSpec:
-    """What a model folder says of itself.
+def read_spec(folder: Path, name: str = DESCRIPTION) -> ModelSpec:
+    """What a model folder says of itself, or a description of that name alone.
 
     Raises:
         ValueError: no model folder, or one of another format.
     """
-    file = folder / DESCRIPTION
+    file = folder / name
     if not file.is_file():
         raise ValueError(
             f"wanted a model folder with {DESCRIPTION}, {folder} has none; "
@@ -78,6 +78,9 @@ def read_model(
         tensors = load_tensors(folder / f"{name}.safetensors")
         fill(network, {k: v.to(device, dtype) for k, v in tensors.items()}, name)
         network.eval().requires_grad_(False)
+    # The one buffer that no file holds: the indices of the image encoder's patches.
+    embeddings = model.image_encoder.vision_model.embeddings
+    embeddings.position_ids = torch.arange(embeddings.num_positions, device=device)[None]
     return model
 
 
