@@ -86,6 +86,8 @@ LIGHT = (
     "flows.commands",
     "flows.config",
     "flows.console",
+    "flows.data",
+    "flows.data_options",
     "flows.edit",
     "flows.engine",
     "flows.job",

@@ -2,21 +2,20 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from svim3d.cameras import Cameras, orbit_cameras
-from svim3d.fields.material_field import Materials
-from svim3d.render.deferred import Geometry, MaterialSource, SurfacePoints
+from svim3d.mesh.source_mesh import SourceMesh
+from svim3d.shading.environment import rotate_about_y
 from svim3d.shading.prefilter import PyramidOperator
-from svim3d.synthesis.bodies import turned
 from svim3d.synthesis.dice import Dice
 from svim3d.synthesis.example import TrainingExample
 from svim3d.synthesis.lights import random_light
-from svim3d.synthesis.objects import SyntheticObject, random_object
+from svim3d.synthesis.objects import random_object
+from svim3d.synthesis.scenes import Scene, scene_of, scene_of_mesh
 from svim3d.synthesis.trajectories import Trajectory, fitting_distance, random_trajectory
 from svim3d.synthesis.views import (
     ViewSamples,
@@ -28,42 +27,6 @@ from svim3d.synthesis.views import (
 
 FOV_DEG = 33.8  # Source: SV3D
 DISPLAY_RANGE = (0.5, 0.9)  # display value that the bright part of the object gets
-
-
-@dataclass(frozen=True)
-class Scene:
-    """Something to take pictures of, turned as it will be seen.
-
-    Attributes:
-        name: tells what it is.
-        geometry: world frame; centred, longest side 1.
-        materials: of its surface.
-        quality: "good" or "low"; low ones do not teach materials.
-    """
-
-    name: str
-    geometry: Geometry
-    materials: MaterialSource
-    quality: str
-
-
-def scene_of(thing: SyntheticObject, yaw_deg: float) -> Scene:
-    """An invented object, turned about the upright axis."""
-    yaw = turned(1, yaw_deg)
-
-    def materials(points: SurfacePoints) -> Materials:
-        # Materials live in the object's own frame.
-        rows = thing.material_rows(points.position @ yaw, points.normal @ yaw, points.face)
-        return Materials(rows[:, :3], rows[:, 3:4], rows[:, 4:5], torch.zeros_like(points.normal))
-
-    assembly = thing.assembly
-    geometry = Geometry(
-        vertices=assembly.vertices @ yaw.T,
-        faces=assembly.faces,
-        normals=assembly.normals @ yaw.T,
-        attributes=assembly.vertices.new_zeros(len(assembly.vertices), 0),
-    )
-    return Scene(thing.name, geometry, materials, thing.quality)
 
 
 def cameras_for(scene: Scene, trajectory: Trajectory, size: int) -> tuple[Cameras, float]:
@@ -143,13 +106,30 @@ def render_example(
     size: int,
     views: int,
     lights: int,
+    mesh: tuple[str, SourceMesh] | None = None,
+    maps: Sequence[tuple[str, Float[Tensor, "n n 3"]]] = (),
 ) -> TrainingExample:
-    """Example `index` of the data set of a seed: a pure function of both."""
+    """Example `index` of the data set of a seed: a pure function of its arguments.
+
+    Args:
+        seed: of the data set.
+        index: of the example.
+        operator: prefilters the lights.
+        size: side of the pictures, pixels.
+        views: of the trajectory.
+        lights: of the example.
+        mesh: name and normalised mesh to show; None invents an object.
+        maps: names and octahedral maps of the operator's size, from which every other light is
+            taken, turned at random; none invents all lights.
+    """
     dice = Dice.of(seed, index)
-    thing = random_object(dice)
-    scene = scene_of(thing, dice.uniform(0.0, 360.0))
+    if mesh is None:
+        thing = random_object(dice)
+        scene = scene_of(thing, dice.uniform(0.0, 360.0))
+    else:
+        scene = scene_of_mesh(*mesh, dice.uniform(0.0, 360.0))
     trajectory = random_trajectory(dice, views)
-    environments = [(f"random-{i}", random_light(dice, operator.size)) for i in range(lights)]
+    environments = [_light(dice, operator.size, maps if i % 2 else ()) for i in range(lights)]
     displays = [dice.uniform(*DISPLAY_RANGE) for _ in range(lights)]
     return photograph(
         scene,
@@ -160,3 +140,14 @@ def render_example(
         size=size,
         seed=f"{seed}:{index}",
     )
+
+
+def _light(
+    dice: Dice, size: int, maps: Sequence[tuple[str, Float[Tensor, "n n 3"]]]
+) -> tuple[str, Float[Tensor, "n n 3"]]:
+    """An invented light, or one of the maps, turned; and what it is called."""
+    if not maps:
+        return "invented", random_light(dice, size)
+    name, radiance = maps[dice.integer(0, len(maps) - 1)]
+    turn = dice.uniform(0.0, 360.0)
+    return f"{name} turned {turn:.0f}", rotate_about_y(radiance, turn)
