@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
+from flows.data_options import data_options
 from flows.options import edit_options, job_options, relight_options
 from flows.train_options import train_options
 
@@ -66,6 +67,10 @@ def _dispatch(options: argparse.Namespace) -> int:
         from flows.train import train
 
         return train(options)
+    if options.command == "data":
+        from flows.data import data
+
+        return data(options)
     from flows import commands
 
     if options.command == "presets":
@@ -108,6 +113,7 @@ def _parser() -> argparse.ArgumentParser:
         ("relight", [relight_options(), shared], "show views or an asset under another light"),
         ("edit", [edit_options(), shared], "write an asset with other materials"),
         ("train", [train_options(), shared], "train a generator on rendered examples"),
+        ("data", [data_options(), shared], "render training data for the generator"),
         ("plan", [job, shared], "say which stages a run would compute, and why"),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
