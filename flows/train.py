@@ -95,9 +95,7 @@ def _train_generator(
     from svim3d.io.clip_file import read_clip
 
     with folder.context("latents", config.generator.checkpoint_every_s) as ctx:
-        clips = precompute_latents(
-            model, examples, folder.root / "latents", config.latents, ctx
-        )
+        clips = precompute_latents(model, examples, folder.root / "latents", config.latents, ctx)
     shown = [read_clip(clips[i]) for i in SHOWN_CLIPS if i < len(clips)]
     with folder.context("generator", config.generator.checkpoint_every_s) as ctx:
         train_generator(

@@ -1,8 +1,8 @@
 """Trains the generator on stored clips, in two phases.
 
 Phase 1 leaves temporal attention alone and takes all examples, those of poor materials for RGB and
-normals only; phase 2 frees everything and takes the others. What a step sees is a function of the
-seed and of the step, so that a run which went on from a checkpoint ends like one that never stopped.
+normals only; phase 2 frees everything and takes the others. What a step sees is a function of seed
+and step, so that a run which went on from a checkpoint ends like one that never stopped.
 
 Source: Engelhardt et al. 2025, SViM3D, section 4.
 """

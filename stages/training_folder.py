@@ -1,10 +1,10 @@
 """A training run's folder: what it is made of, and how it goes on.
 
-    settings.json      settings, model and data that the run was begun with
-    autoencoder/       checkpoint and losses; sheet.png
-    latents/           a clip file per example
-    generator/         checkpoint and losses; sheet-<steps>.png
-    model/             a complete model folder, of the last checkpoint
+settings.json      settings, model and data that the run was begun with
+autoencoder/       checkpoint and losses; sheet.png
+latents/           a clip file per example
+generator/         checkpoint and losses; sheet-<steps>.png
+model/             a complete model folder, of the last checkpoint
 """
 
 import json

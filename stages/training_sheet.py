@@ -20,7 +20,6 @@ STEPS = 10  # of the sampler: enough to see what is learnt
 SCALE = 2  # pixels of the sheet per pixel of a picture
 
 
-
 def draw_generator_sheet(
     model: MaterialDiffusion, clips: list[StoredClip], file: Path, seed: int
 ) -> None:
@@ -30,23 +29,23 @@ def draw_generator_sheet(
     for clip in clips:
         truth = torch.cat([clip.rgb[0][None], clip.materials[int(clip.form[0])]]).float()
         shown = clip.pictures[0, -1].to(model.device).float() / 127.5 - 1.0
-        camera = camera_numbers(
-            clip.elevation_deg[0], clip.azimuth_deg[0], model.spec.cond_aug
-        ).to(model.device)
+        camera = camera_numbers(clip.elevation_deg[0], clip.azimuth_deg[0], model.spec.cond_aug).to(
+            model.device
+        )
         conditioning = Conditioning(
             token=embed_picture(model.image_encoder, shown[None]).detach(),
             latent=truth[0, -1][None].to(model.device),
             camera=camera[None],
         )
-        drawn = model.draw(conditioning, seed, Sampling(steps=STEPS)).cpu() / model.spec.latent_scale
+        drawn = (
+            model.draw(conditioning, seed, Sampling(steps=STEPS)).cpu() / model.spec.latent_scale
+        )
         ours = drawn.unflatten(1, (len(model.spec.groups), -1)).transpose(0, 1)
         frames = torch.linspace(0, len(camera) - 1, COLUMNS).round().long()
         for group, name in enumerate(model.spec.groups):
             for kind, latents in (("truth", truth), ("ours", ours)):
                 rows += _pictures(model.autoencoder, latents[group, frames])
-                labels += [
-                    f"{name}, {kind}, {float(a):.0f}" for a in clip.azimuth_deg[0][frames]
-                ]
+                labels += [f"{name}, {kind}, {float(a):.0f}" for a in clip.azimuth_deg[0][frames]]
     write_png(file, contact_sheet(rows, labels, columns=COLUMNS))
 
 
@@ -60,9 +59,7 @@ def draw_autoencoder_sheet(autoencoder: AutoencoderKL, example: Path, file: Path
         latents = encode(autoencoder, inputs.to(device))
     back = _pictures(autoencoder, latents.cpu())
     there = list(_enlarged(some.float() / 255.0))
-    write_png(
-        file, contact_sheet([*there, *back], [""] * (2 * len(there)), columns=len(there))
-    )
+    write_png(file, contact_sheet([*there, *back], [""] * (2 * len(there)), columns=len(there)))
 
 
 @torch.no_grad()

@@ -5,6 +5,8 @@ from diffusers import AutoencoderKL
 from jaxtyping import Float
 from torch import Tensor
 
+__all__ = ["AutoencoderKL", "decode", "encode"]
+
 PICTURES_AT_A_TIME = 21  # one group of a clip: 3 GB of activations at 576 px in bfloat16
 
 

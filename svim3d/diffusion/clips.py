@@ -1,7 +1,7 @@
-"""Clips as the trainer keeps them: latents and cameras of one object from all sides, in some lights.
+"""Clips as the trainer keeps them: latents and cameras of an object from all sides, in some lights.
 
-An object may be kept twice, as it is and mirrored; and of an evenly spaced orbit any frame may stand
-as the reference view, since turning the object only shifts its frames.
+An object may be kept twice, as it is and mirrored; and of an evenly spaced orbit any frame may
+stand as the reference view, since turning the object only shifts its frames.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class StoredClip:
 
     Attributes:
         rgb: of each light.
-        materials: basecolor, ORM and normal; as the object is, and mirrored if any light sees it so.
+        materials: basecolor, ORM and normal; of the object, and mirrored if any light sees it so.
         form: for each light, which of `materials` (0 or 1) goes with it.
         pictures: each frame as the image encoder sees it, display-referred, 8 bit.
         elevation_deg: of each frame, for each form.

@@ -138,9 +138,7 @@ def autoencoder_loss(
     small weight.
     """
     divergence = 0.5 * (mean**2 + log_variance.exp() - 1.0 - log_variance)
-    edges = sum(
-        (answer.diff(dim=axis) - pictures.diff(dim=axis)).abs().mean() for axis in (-1, -2)
-    )
+    edges = sum((answer.diff(dim=axis) - pictures.diff(dim=axis)).abs().mean() for axis in (-1, -2))
     return {
         "color": (answer - pictures).abs().mean() + ((answer - pictures) ** 2).mean(),
         "edges": edge_weight * torch.as_tensor(edges),
@@ -154,7 +152,7 @@ class MovingAverage:
     Attributes:
         values: averages by name.
 
-    Source: the ramp min(decay, (1 + n) / (10 + n)) is that of TensorFlow's ExponentialMovingAverage.
+    Source: the ramp min(decay, (1 + n) / (10 + n)) is TensorFlow's (ExponentialMovingAverage).
     """
 
     def __init__(self, parameters: Iterable[tuple[str, nn.Parameter]], decay: float) -> None:
