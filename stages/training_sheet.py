@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from svim3d.diffusion.autoencoder import AutoencoderKL, decode, encode
+from svim3d.diffusion.autoencoder import Autoencoder, decode, encode
 from svim3d.diffusion.clips import StoredClip
 from svim3d.diffusion.conditioning import Conditioning, camera_numbers, embed_picture
 from svim3d.diffusion.groups import as_network_input
@@ -49,7 +49,7 @@ def draw_generator_sheet(
     write_png(file, contact_sheet(rows, labels, columns=COLUMNS))
 
 
-def draw_autoencoder_sheet(autoencoder: AutoencoderKL, example: Path, file: Path) -> None:
+def draw_autoencoder_sheet(autoencoder: Autoencoder, example: Path, file: Path) -> None:
     """Pictures of an example above what comes back of them."""
     read = read_example(example)
     some = torch.cat([read.rgb[0, ::7], read.basecolor[::7], read.orm[::7], read.normal[::7]])
@@ -64,7 +64,7 @@ def draw_autoencoder_sheet(autoencoder: AutoencoderKL, example: Path, file: Path
 
 @torch.no_grad()
 def _pictures(
-    autoencoder: AutoencoderKL, latents: Float[Tensor, "n z h w"]
+    autoencoder: Autoencoder, latents: Float[Tensor, "n z h w"]
 ) -> list[Float[Tensor, "H W 3"]]:
     device = next(autoencoder.parameters()).device
     decoded = decode(autoencoder, latents.float().to(device)).cpu().permute(0, 2, 3, 1)

@@ -11,18 +11,16 @@ Precision = Literal["float32", "bfloat16"]
 
 
 class AutoencoderTrainingConfig(StageConfig):
-    """From pictures to latents and back."""
+    """From pictures to latents and back, for a model with a small autoencoder of its own."""
 
     steps: PositiveInt = 3000
     """Optimiser steps."""
-    batch: PositiveInt = 16
+    batch: PositiveInt = 32
     """Pictures of a step, of all groups alike."""
-    rate: PositiveFloat = 2e-3
+    rate: PositiveFloat = 1e-3
     """Adam's step after warming up; it falls to a hundredth along a cosine."""
     edge_weight: NonNegativeFloat = 1.0
     """Weight of differences between neighbouring pixels."""
-    divergence_weight: NonNegativeFloat = 1e-4
-    """Weight of the latents' divergence from the unit normal."""
     objects: PositiveInt = 400
     """Examples kept in memory at once; later ones are passed over."""
     precision: Precision = "bfloat16"

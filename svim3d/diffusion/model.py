@@ -5,13 +5,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
-from diffusers import AutoencoderKL
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from svim3d.diffusion.autoencoder import decode, encode
+from svim3d.diffusion.autoencoder import Autoencoder, build_autoencoder, decode, encode
 from svim3d.diffusion.conditioning import Conditioning, camera_numbers, embed_picture
 from svim3d.diffusion.groups import GROUPS, GeneratedViews, as_network_input, unpack
 from svim3d.diffusion.guidance import (
@@ -45,7 +44,7 @@ class ModelSpec:
         cond_aug: noise that the network believes to be on the reference view.
         transfer: how RGB is encoded for display.
         unet: arguments of `MaterialVideoUNet`.
-        autoencoder: arguments of diffusers' `AutoencoderKL`.
+        autoencoder: arguments of diffusers' `AutoencoderKL` or of `PatchAutoencoder`.
         image_encoder: arguments of transformers' `CLIPVisionConfig`.
     """
 
@@ -70,8 +69,9 @@ class ModelSpec:
     @property
     def latent_side(self) -> int:
         """Side of a latent picture."""
-        halvings = len(self.autoencoder["block_out_channels"]) - 1
-        return int(self.image_size // 2**halvings)
+        if "patch" in self.autoencoder:
+            return int(self.image_size // self.autoencoder["patch"])
+        return int(self.image_size // 2 ** (len(self.autoencoder["block_out_channels"]) - 1))
 
     @property
     def latent_channels(self) -> int:
@@ -153,7 +153,7 @@ class MaterialDiffusion:
         self,
         spec: ModelSpec,
         unet: MaterialVideoUNet,
-        autoencoder: AutoencoderKL,
+        autoencoder: Autoencoder,
         image_encoder: CLIPVisionModelWithProjection,
     ) -> None:
         self.spec = spec
@@ -167,7 +167,7 @@ class MaterialDiffusion:
         return cls(
             spec,
             MaterialVideoUNet(**spec.unet),
-            AutoencoderKL(**spec.autoencoder),
+            build_autoencoder(spec.autoencoder),
             CLIPVisionModelWithProjection(CLIPVisionConfig(**spec.image_encoder)),
         )
 

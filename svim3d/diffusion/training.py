@@ -123,26 +123,17 @@ def separate_frames(unet: MaterialVideoUNet) -> None:
                 nn.init.zeros_(parameter)
 
 
-def autoencoder_loss(
+def picture_loss(
     answer: Float[Tensor, "n 3 H W"],
     pictures: Float[Tensor, "n 3 H W"],
-    mean: Float[Tensor, "n z h w"],
-    log_variance: Float[Tensor, "n z h w"],
     *,
     edge_weight: float,
-    divergence_weight: float,
 ) -> dict[str, Float[Tensor, ""]]:
-    """Weighted terms: colours, their differences between neighbours, latents near the unit normal.
-
-    Source: Kingma and Welling 2014, appendix B, for the divergence; Rombach et al. 2022 for its
-    small weight.
-    """
-    divergence = 0.5 * (mean**2 + log_variance.exp() - 1.0 - log_variance)
+    """Weighted terms: colours, and their differences between neighbours."""
     edges = sum((answer.diff(dim=axis) - pictures.diff(dim=axis)).abs().mean() for axis in (-1, -2))
     return {
         "color": (answer - pictures).abs().mean() + ((answer - pictures) ** 2).mean(),
         "edges": edge_weight * torch.as_tensor(edges),
-        "divergence": divergence_weight * divergence.mean(),
     }
 
 
