@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float, UInt8
-from torch import Tensor
+from torch import Tensor, nn
 
 from stages.base import Context
 from stages.errors import InputError
@@ -27,7 +27,7 @@ COMPONENT_PICTURES = 8192
 
 
 def train_autoencoder(
-    autoencoder: PatchAutoencoder,
+    autoencoder: nn.Module,
     examples: Sequence[Path],
     config: AutoencoderTrainingConfig,
     ctx: Context,
@@ -36,7 +36,15 @@ def train_autoencoder(
 
     Returns:
         The factor that brings latents to unit variance.
+
+    Raises:
+        InputError: no examples, or an autoencoder that is only ever taken as it is.
     """
+    if not isinstance(autoencoder, PatchAutoencoder):
+        raise InputError(
+            "an autoencoder of this kind is not trained here; start from a model folder that has a "
+            "trained one: svim3d train --model FOLDER"
+        )
     pictures = load_pictures(examples[: config.objects])
     some = _some(pictures, COMPONENT_PICTURES, ctx.generator("components")).to(ctx.device)
     autoencoder.fit_components(some)
