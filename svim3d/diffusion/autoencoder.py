@@ -1,6 +1,6 @@
 """From pictures to latents and back, a few pictures at a time."""
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from diffusers import AutoencoderKL
@@ -11,7 +11,7 @@ from svim3d.diffusion.patch_autoencoder import PatchAutoencoder
 
 PICTURES_AT_A_TIME = 21  # one group of a clip: 3 GB of activations at 576 px in bfloat16
 
-Autoencoder = AutoencoderKL | PatchAutoencoder
+Autoencoder: TypeAlias = AutoencoderKL | PatchAutoencoder
 
 
 def build_autoencoder(arguments: dict[str, Any]) -> Autoencoder:
