@@ -66,3 +66,8 @@ def box(x: float, y: float, z: float, *, bevel: float = 0.03) -> Shape:
 def surface_point(shape: Shape, direction: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     """The vertex that lies farthest along a direction."""
     return shape.vertices[int((shape.vertices @ direction).argmax())]
+
+
+def random_vertex(shape: Shape, dice: Dice) -> Float[Tensor, "3"]:
+    """Any point of the surface that carries a vertex."""
+    return shape.vertices[dice.integer(0, len(shape.vertices) - 1)]
