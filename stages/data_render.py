@@ -189,7 +189,11 @@ def _mesh(file: Path) -> SourceMesh:
 @functools.lru_cache(maxsize=1)
 def _maps(files: tuple[Path, ...]) -> tuple[tuple[str, Float[Tensor, "n n 3"]], ...]:
     """Names and octahedral maps of environment files."""
-    return tuple((file.stem, read_light(file).octahedral(SIZE)) for file in files)
+
+    def silent(_kind: str, _message: str) -> None:
+        """A few mended texels do not matter here, and every process would tell of them."""
+
+    return tuple((file.stem, read_light(file, silent).octahedral(SIZE)) for file in files)
 
 
 def _claim(request: DataRequest) -> None:
