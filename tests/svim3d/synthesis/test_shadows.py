@@ -101,7 +101,7 @@ def test_the_compiled_kernel_is_its_twin():
     generator = torch.Generator().manual_seed(1)
     scene = geometry(
         box(0.3, 0.2, 0.4),
-        superquadric(1.0, 1.0, 12).placed(scale=(0.2,) * 3, offset=(0.3, 0.3, 0)),
+        superquadric(1.0, 1.0, 12).placed(scale=(0.2,) * 3, offset=(0.3, 0.3, 0.0)),
     )
     points = scene.vertices
     normals = scene.normals

@@ -1,4 +1,4 @@
-"""Materials as functions of space: noise, patterns, layers, and what tells good from low quality."""
+"""Materials as functions of space: noise, patterns, layers, good and low quality."""
 
 import pytest
 import torch

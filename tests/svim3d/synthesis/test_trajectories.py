@@ -1,5 +1,6 @@
 """Camera paths and the distance that fits an object into all views."""
 
+import itertools
 import math
 
 import pytest
@@ -41,7 +42,7 @@ def test_dynamic_paths_ascend_and_end_at_the_reference():
     for path in draws(60):
         azimuth = path.azimuth_deg
         assert azimuth[-1] == 0.0
-        assert all(a < b for a, b in zip(azimuth[:-2], azimuth[1:-1], strict=True))
+        assert all(a < b for a, b in itertools.pairwise(azimuth[:-1]))
         assert azimuth[0] > 0.0 and azimuth[-2] < 360.0
         assert max(map(abs, path.elevation_deg)) <= MAX_ELEVATION_DEG
 
