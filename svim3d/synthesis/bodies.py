@@ -42,7 +42,9 @@ def turned_at_random(dice: Dice) -> Float[Tensor, "3 3"]:
 
 def random_body(dice: Dice) -> Shape:
     """One shape of any kind, within about the cube of half side 1."""
-    kind = dice.choice(("lathe", "superquadric", "extrusion", "solid", "box"), (2.0, 2.0, 2.0, 2.0, 1.5))
+    kind = dice.choice(
+        ("lathe", "superquadric", "extrusion", "solid", "box"), (2.0, 2.0, 2.0, 2.0, 1.5)
+    )
     if kind == "lathe":
         return lathe(random_profile(dice), circle(SEGMENTS))
     if kind == "superquadric":

@@ -11,7 +11,7 @@ from svim3d.color import linear_from_srgb, luminance, srgb_from_linear
 from svim3d.mesh.source_mesh import SourceMaterial, complete
 from svim3d.shading.prefilter import PyramidOperator
 from svim3d.synthesis.dice import Dice
-from svim3d.synthesis.examples import DISPLAY_RANGE, FOV_DEG, photograph, render_example
+from svim3d.synthesis.examples import FOV_DEG, photograph, render_example
 from svim3d.synthesis.lights import random_light
 from svim3d.synthesis.materials import Layer, Matter, SolidMaterial
 from svim3d.synthesis.objects import SyntheticObject
@@ -33,7 +33,7 @@ def operator():
 
 def sphere_with_spot_on_plus_x():
     assembly = assemble([superquadric(1.0, 1.0, 64).placed(scale=(0.5, 0.5, 0.5))])
-    spot = Layer(RED, Decal((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0), 0.2, "disc"))
+    spot = Layer(RED, Decal((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0), 0.3, "disc"))
     faces = torch.zeros(len(assembly.faces), dtype=torch.long)
     return SyntheticObject("ball", assembly, faces, (SolidMaterial(GREY, (spot,)),), "good")
 
@@ -58,7 +58,7 @@ def ball(operator):
 
 def centre_of_spot(example, view):
     """Column and row of the red patch, in pixels; None where it is not seen."""
-    red = example.orm[view, ..., 2] > 128
+    red = example.orm[view, ..., 2] > 64
     if not bool(red.any()):
         return None
     row, column = torch.nonzero(red).float().mean(0) + 0.5
@@ -104,6 +104,7 @@ def test_normals_are_those_of_a_sphere_in_the_cameras_frame(ball):
     expected = (origin + distance[:, None] * direction) / 0.5
     inner = expected[:, 2] > 0.35  # a pixel at the rim averages over much of the sphere
     inner &= hit > 0.0
+    inner &= ball.mask[3].reshape(-1) == 255  # others are blends with black
     for view in range(4):
         measured = ball.normal[view].reshape(-1, 3)[inner].float() / 127.5 - 1.0
         cosine = (torch.nn.functional.normalize(measured, dim=1) * expected[inner]).sum(1)
@@ -175,15 +176,14 @@ def test_an_example_is_a_function_of_seed_and_index(operator):
     assert not torch.equal(render_example(4, 8, operator, **wanted).rgb, first.rgb)
 
 
-@pytest.mark.parametrize("index", range(10))
+@pytest.mark.parametrize("index", range(8))
 def test_no_view_cuts_the_object_off(operator, index):
-    example = render_example(11, index, operator, size=32, views=9, lights=1)
+    example = render_example(11, index, operator, size=64, views=7, lights=1)
     mask = example.mask[..., 0]
     border = torch.cat([mask[:, 0], mask[:, -1], mask[:, :, 0], mask[:, :, -1]], 1)
     assert int(border.max()) == 0
     assert int(mask.sum((1, 2)).min()) > 0
     assert example.azimuth_deg[-1] == 0.0
-    assert DISPLAY_RANGE[0] > 0.0
 
 
 def test_lights_from_files_are_turned_and_named(operator):
