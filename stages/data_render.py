@@ -35,6 +35,7 @@ SUMMARY = "dataset.json"
 MESH_SUFFIXES = (".glb", ".gltf", ".obj")
 # One thread a process: the pictures are small, and as many processes as cores are wanted anyway.
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+EXAMPLES_PER_CALL = 4  # that a process is handed at a time: about a second of work
 KEPT_MESHES = 4  # that a process holds: examples of one mesh are far apart
 
 Status = Literal["made", "kept", "skipped"]
@@ -142,23 +143,36 @@ def _outcomes(request: DataRequest, indices: range, workers: int) -> Iterator[Ou
     if workers <= 1:
         yield from map(make, indices)
         return
-    for name, value in ONE_THREAD.items():
-        os.environ[name] = value
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
     # Fresh processes: a fork would share locks of thread pools that may be held.
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=context)
+    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
     try:
-        yield from pool.map(make, indices, chunksize=4)
+        yield from pool.map(make, indices, chunksize=EXAMPLES_PER_CALL)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
 
 
 def make_example(request: DataRequest, index: int) -> Outcome:
     """Render and write one example, unless it is there."""
-    torch.set_num_threads(1)
     file = example_file(request.folder, index)
     if is_whole(file):
         return Outcome(index, "kept")
+    # Sums over several threads would differ in their last bits from machine to machine.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _make(request, index, file)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _make(request: DataRequest, index: int, file: Path) -> Outcome:
+    """Render and write one example."""
     mesh = None
     if request.meshes:
         path = request.meshes[index % len(request.meshes)]
@@ -189,7 +203,11 @@ def _mesh(file: Path) -> SourceMesh:
 @functools.lru_cache(maxsize=1)
 def _maps(files: tuple[Path, ...]) -> tuple[tuple[str, Float[Tensor, "n n 3"]], ...]:
     """Names and octahedral maps of environment files."""
-    return tuple((file.stem, read_light(file).octahedral(SIZE)) for file in files)
+
+    def silent(_kind: str, _message: str) -> None:
+        """A few mended texels do not matter here, and every process would tell of them."""
+
+    return tuple((file.stem, read_light(file, silent).octahedral(SIZE)) for file in files)
 
 
 def _claim(request: DataRequest) -> None:

@@ -42,7 +42,9 @@ def turned_at_random(dice: Dice) -> Float[Tensor, "3 3"]:
 
 def random_body(dice: Dice) -> Shape:
     """One shape of any kind, within about the cube of half side 1."""
-    kind = dice.choice(("lathe", "superquadric", "extrusion", "solid", "box"), (2, 2, 2, 2, 1.5))
+    kind = dice.choice(
+        ("lathe", "superquadric", "extrusion", "solid", "box"), (2.0, 2.0, 2.0, 2.0, 1.5)
+    )
     if kind == "lathe":
         return lathe(random_profile(dice), circle(SEGMENTS))
     if kind == "superquadric":
@@ -66,3 +68,8 @@ def box(x: float, y: float, z: float, *, bevel: float = 0.03) -> Shape:
 def surface_point(shape: Shape, direction: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     """The vertex that lies farthest along a direction."""
     return shape.vertices[int((shape.vertices @ direction).argmax())]
+
+
+def random_vertex(shape: Shape, dice: Dice) -> Float[Tensor, "3"]:
+    """Any point of the surface that carries a vertex."""
+    return shape.vertices[dice.integer(0, len(shape.vertices) - 1)]

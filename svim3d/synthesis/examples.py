@@ -16,6 +16,7 @@ from svim3d.synthesis.example import TrainingExample
 from svim3d.synthesis.lights import random_light
 from svim3d.synthesis.objects import random_object
 from svim3d.synthesis.scenes import Scene, scene_of, scene_of_mesh
+from svim3d.synthesis.shadows import DepthPictures, shadowed_radiance
 from svim3d.synthesis.trajectories import Trajectory, fitting_distance, random_trajectory
 from svim3d.synthesis.views import (
     ViewSamples,
@@ -63,8 +64,12 @@ def photograph(
     samples = sample_views(scene.geometry, scene.materials, cameras)
     mask = samples.mask
     pictures = []
-    for (_, radiance), display in zip(lights, displays, strict=True):
-        picture = samples.image(samples.radiance(operator(radiance)))
+    pyramids = [operator(radiance) for _, radiance in lights]
+    shadows = DepthPictures.of(scene.geometry)
+    for radiance, display in zip(
+        shadowed_radiance(samples, shadows, pyramids), displays, strict=True
+    ):
+        picture = samples.image(radiance)
         picture = picture * exposure_for(picture, mask, display)
         pictures.append(on_background(picture, mask, background=1.0, srgb=True))
     elevation, azimuth = (torch.tensor(a) for a in zip(*trajectory.angles, strict=True))

@@ -18,6 +18,8 @@ def random_light(dice: Dice, size: int = SIZE) -> Float[Tensor, "size size 3"]:
     directions = texel_directions(size)
     radiance = gradient(dice, directions)
     kind = dice.choice(("boxes", "sun", "soft", "mixture"), (3.0, 2.0, 1.0, 2.0))
+    if kind != "soft":
+        radiance = radiance * dice.logarithmic(0.1, 1.0)
     if kind in ("boxes", "mixture"):
         for _ in range(dice.integer(1, 6)):
             radiance = radiance + soft_box(dice, directions)

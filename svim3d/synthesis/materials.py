@@ -313,11 +313,13 @@ def with_decal(material: SolidMaterial, dice: Dice) -> SolidMaterial:
 def mottled(matter: Matter, dice: Dice) -> Layer:
     """Slight unevenness of one stuff: colour and roughness move together."""
     uneven = Matter(
-        shaded(matter.basecolor, dice.uniform(0.6, 1.3)),
+        shaded(matter.basecolor, dice.uniform(0.7, 1.25)),
         min(1.0, max(0.05, matter.roughness + dice.uniform(-0.15, 0.2))),
         matter.metallic,
     )
-    return Layer(uneven, patches(dice, frequency=dice.uniform(2.0, 10.0), share=0.5), 0.7)
+    return Layer(
+        uneven, patches(dice, frequency=dice.uniform(2.0, 10.0), share=0.5), dice.uniform(0.1, 0.9)
+    )
 
 
 def scratches(bare: Matter, dice: Dice) -> Layer:

@@ -108,7 +108,7 @@ def handle_path(
 ) -> Float[Tensor, "M 3"]:
     """A bow in the x, y plane from (attach, low) out to `attach + reach` and back in at `high`."""
     t = torch.linspace(0.0, math.pi, count)
-    x = attach + reach * t.sin().pow(0.7)
+    x = attach + reach * t.sin().clamp_min(0.0).pow(0.7)  # the sine of pi rounds below 0
     y = 0.5 * (low + high) - 0.5 * (high - low) * t.cos()
     return torch.stack([x, y, torch.zeros_like(x)], 1)
 

@@ -5,8 +5,8 @@ object's longest side is 1 and its centre is the origin.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -18,14 +18,8 @@ from svim3d.synthesis.noise import fractal_noise
 DECAL_FACING = 0.25  # cosine to a decal's axis below which paint sprayed along it does not stick
 
 
-class Pattern(Protocol):
-    """Coverage of a layer."""
-
-    def __call__(
-        self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]
-    ) -> Float[Tensor, "P 1"]:
-        """Coverage in [0, 1] at points of the surface."""
-        ...
+# Positions and unit normals of P points, object frame -> coverage in [0, 1], [P, 1].
+Pattern = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)

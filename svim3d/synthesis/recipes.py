@@ -10,7 +10,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from svim3d.synthesis.bodies import Part, box, random_body, surface_point, turned, turned_at_random
+from svim3d.synthesis.bodies import (
+    Part,
+    box,
+    random_body,
+    random_vertex,
+    surface_point,
+    turned,
+    turned_at_random,
+)
 from svim3d.synthesis.dice import Dice
 from svim3d.synthesis.outlines import (
     SEGMENTS,
@@ -22,6 +30,7 @@ from svim3d.synthesis.outlines import (
     vessel_profile,
 )
 from svim3d.synthesis.shapes import Shape, circle, extrusion, lathe, superquadric, tube
+from svim3d.synthesis.solids import random_figure
 
 Recipe = Callable[[Dice], list[Part]]
 
@@ -155,30 +164,36 @@ def creature(dice: Dice) -> list[Part]:
     """A body with a head and mirrored limbs: toy, animal, robot, aircraft."""
     size = dice.uniforms(0.4, 0.9, 3)
     body = superquadric(dice.logarithmic(0.3, 1.3), dice.logarithmic(0.3, 1.3), 18)
-    parts = [Part(body.placed(scale=size.tolist()), 0)]
+    body = body.placed(scale=size.tolist())
     head = random_body(dice).placed(rotation=turned(1, 90.0 * dice.integer(0, 3)))
-    where = torch.tensor([0.0, float(size[1]) * dice.uniform(0.5, 1.2), float(size[2]) * 0.9])
-    parts.append(Part(head.placed(scale=[dice.uniform(0.25, 0.5)] * 3, offset=where.tolist()), 1))
+    where = surface_point(body, torch.tensor([0.0, dice.uniform(0.2, 1.0), 0.6]))
+    where = where * torch.tensor([0.0, 1.0, 1.0])
+    head = head.placed(scale=[dice.uniform(0.25, 0.5)] * 3, offset=where.tolist())
+    parts = [Part(body, 0), Part(head, 1)]
     for _ in range(dice.integer(1, 3)):
         limb = random_body(dice).placed(
             scale=(dice.uniforms(0.08, 0.3, 3) * torch.tensor([1.0, 2.0, 1.0])).tolist(),
             rotation=turned(dice.choice((0, 2)), dice.uniform(-60.0, 60.0)),
         )
-        offset = torch.tensor(
-            [
-                float(size[0]) * 0.9,
-                dice.uniform(-0.9, 0.4) * float(size[1]),
-                dice.uniform(-0.7, 0.7) * float(size[2]),
-            ]
-        )
+        joint = random_vertex(body, dice)
+        limb = limb.placed(offset=[abs(float(joint[0])), float(joint[1]), float(joint[2])])
         material = dice.integer(1, 3)
-        parts.append(Part(limb.placed(offset=offset.tolist()), material))
-        mirrored = limb.placed(offset=offset.tolist()).placed(scale=(-1.0, 1.0, 1.0))
-        parts.append(Part(mirrored, material))
+        parts += [Part(limb, material), Part(limb.placed(scale=(-1.0, 1.0, 1.0)), material)]
     eye = superquadric(1.0, 1.0, 8).placed(scale=[dice.uniform(0.05, 0.1)] * 3)
     for side in (-1, 1):
-        place = surface_point(parts[1].shape, torch.tensor([0.5 * side, 0.35, 1.0]))
+        place = surface_point(head, torch.tensor([0.5 * side, 0.35, 1.0]))
         parts.append(Part(eye.placed(offset=place.tolist()), 3))
+    return parts
+
+
+def figure(dice: Dice) -> list[Part]:
+    """A statuette: body, head, limbs and ears grown into one smooth solid, left like right."""
+    parts = [Part(random_figure(dice), 0)]
+    if dice.chance(0.6):
+        base = extrusion(random_outline(dice), dice.uniform(0.1, 0.3), 0.04)
+        low = float(parts[0].shape.bounds[0][1])
+        width = dice.uniform(0.4, 0.7)
+        parts.append(Part(base.placed(scale=(width, 1.0, width), offset=(0.0, low, 0.0)), 1))
     return parts
 
 
@@ -198,33 +213,37 @@ def wire(dice: Dice) -> list[Part]:
 
 
 def rings(dice: Dice) -> list[Part]:
-    """Closed loops through each other or about a core: chains, wheels, frames."""
-    parts = []
+    """Closed loops that touch each other, perhaps about a core: chains, wheels, frames."""
+    parts: list[Part] = []
     for _ in range(dice.integer(1, 3)):
         outline = random_outline(dice) * dice.uniform(0.55, 0.95)
-        # Only the loop's length matters here, so an outline serves as a path.
+        # Any outline serves as a path.
         path = torch.stack([outline[:, 0], torch.zeros(len(outline)), outline[:, 1]], 1)
         section = polygon(dice.choice((4, 6, 16)), 2, 0.4)
         loop = tube(path, torch.full((len(path),), dice.uniform(0.08, 0.2)), section, joined=True)
-        loop = loop.placed(
-            rotation=turned_at_random(dice), offset=dice.uniforms(-0.3, 0.3, 3).tolist()
-        )
+        loop = loop.placed(rotation=turned_at_random(dice))
+        if parts:
+            meeting = random_vertex(parts[-1].shape, dice) - random_vertex(loop, dice)
+            loop = loop.placed(offset=meeting.tolist())
         parts.append(Part(loop, dice.integer(0, 2)))
     if dice.chance(0.7):
-        core = random_body(dice).placed(scale=[dice.uniform(0.25, 0.5)] * 3)
+        core = random_body(dice).placed(
+            scale=[dice.uniform(0.25, 0.5)] * 3, offset=random_vertex(parts[0].shape, dice).tolist()
+        )
         parts.append(Part(core, dice.integer(0, 3)))
     return parts
 
 
 def heap(dice: Dice) -> list[Part]:
     """Three to six bodies grown into each other anyhow."""
-    parts = []
+    parts: list[Part] = []
     for _ in range(dice.integer(3, 6)):
         shape = random_body(dice).placed(
-            scale=[dice.uniform(0.25, 0.6)] * 3,
-            rotation=turned_at_random(dice),
-            offset=dice.uniforms(-0.5, 0.5, 3).tolist(),
+            scale=[dice.uniform(0.25, 0.6)] * 3, rotation=turned_at_random(dice)
         )
+        if parts:
+            place = random_vertex(dice.choice(parts).shape, dice)
+            shape = shape.placed(offset=place.tolist())
         parts.append(Part(shape, dice.integer(0, 3)))
     return parts
 
@@ -257,7 +276,8 @@ RECIPES: tuple[tuple[Recipe, float], ...] = (
     (stack, 1.3),
     (vessel, 2.0),
     (furniture, 1.3),
-    (creature, 1.6),
+    (creature, 1.5),
+    (figure, 1.5),
     (wire, 0.8),
     (rings, 0.8),
     (heap, 1.2),

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from svim3d.mesh.mesh import face_normals_scaled, signed_volume
+from svim3d.mesh.mesh import face_normals_scaled, signed_volume, vertex_normals
 from svim3d.numerics import normalize
 
 SHARP_CREASE_DEG = 35.0  # edges of bevels and rims stay visible, facets of 24 around do not
@@ -225,6 +225,8 @@ def creased(
     A corner's normal is the area-weighted mean over the faces around its vertex that deviate from
     the corner's own face by less than the crease angle.
     """
+    if shape.crease_deg >= NO_CREASE_DEG:
+        return shape.vertices, shape.faces, vertex_normals(shape.vertices, shape.faces)
     corners = shape.faces.reshape(-1).long()
     scaled = face_normals_scaled(shape.vertices, shape.faces)
     unit = normalize(scaled)
@@ -245,9 +247,11 @@ def creased(
 def _merged(
     points: Float[Tensor, "C 3"], normals: Float[Tensor, "C 3"], corners: Int[Tensor, "C"]
 ) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"], Float[Tensor, "V 3"]]:
-    """Corners of one vertex whose normals agree to a thousandth become one again."""
-    key = torch.cat([corners[:, None], (normals * 1000.0).round().long()], 1)
-    _, index = torch.unique(key, dim=0, return_inverse=True)
+    """Corners of one vertex whose normals agree to 1/500 become one again."""
+    steps = ((normals + 1.0) * 500.0).round().long()
+    # Ten bits for each component, the vertex above them.
+    key = ((corners << 10 | steps[:, 0]) << 10 | steps[:, 1]) << 10 | steps[:, 2]
+    _, index = torch.unique(key, return_inverse=True)
     count = int(index.max()) + 1
     # The last corner of each group speaks for it; which one does not matter.
     chosen = torch.zeros(count, dtype=torch.long).scatter_reduce_(

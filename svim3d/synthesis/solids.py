@@ -98,3 +98,32 @@ def random_solid(dice: Dice) -> Shape:
         bite = random_primitive(dice, points - centre, dice.uniform(0.2, 0.4))
         sdf = smooth_difference(sdf, bite, 0.5 * blend)
     return shape_from_distance(sdf)
+
+
+def random_figure(dice: Dice) -> Shape:
+    """A body with head, limbs, ears and tail, grown together; left mirrors right."""
+    points = grid_points()
+    half = torch.stack([points[..., 0].abs(), points[..., 1], points[..., 2]], -1)
+    blend = dice.uniform(0.08, 0.25)
+    size = torch.tensor([dice.uniform(0.2, 0.45), dice.uniform(0.3, 0.6), dice.uniform(0.2, 0.6)])
+    sdf = ellipsoid(points, size)
+    neck = size * torch.tensor([0.0, dice.uniform(0.6, 1.1), dice.uniform(0.0, 0.9)])
+    head = dice.uniforms(0.15, 0.35, 3)
+    sdf = smooth_union(sdf, ellipsoid(points - neck, head), blend)
+    snout = neck + torch.tensor([0.0, dice.uniform(-0.1, 0.05), float(head[2])])
+    sdf = smooth_union(sdf, ellipsoid(points - snout, dice.uniforms(0.06, 0.16, 3)), blend)
+    ear = neck + torch.stack([0.6 * head[0], head[1], torch.tensor(0.0)])
+    up = torch.tensor([dice.uniform(0.0, 0.08), dice.uniform(0.05, 0.3), dice.uniform(-0.1, 0.1)])
+    sdf = smooth_union(sdf, capsule(half - ear, up, dice.uniform(0.04, 0.09)), 0.08)
+    for _ in range(dice.integer(1, 3)):
+        joint = size * torch.tensor([0.8, dice.uniform(-0.9, 0.5), dice.uniform(-0.9, 0.9)])
+        bone = torch.tensor(
+            [dice.uniform(0.0, 0.2), dice.uniform(-0.4, 0.05), dice.uniform(-0.15, 0.25)]
+        )
+        limb = capsule(half - joint - 0.5 * bone, bone, dice.uniform(0.06, 0.14))
+        sdf = smooth_union(sdf, limb, blend)
+    if dice.chance(0.6):
+        root = size * torch.tensor([0.0, dice.uniform(-0.6, 0.3), -1.0])
+        tail = torch.tensor([0.0, dice.uniform(-0.1, 0.3), dice.uniform(-0.25, -0.05)])
+        sdf = smooth_union(sdf, capsule(points - root, tail, dice.uniform(0.04, 0.1)), 0.1)
+    return shape_from_distance(sdf)

@@ -17,7 +17,7 @@ from svim3d.raster.interpolation import interpolate
 from svim3d.raster.zbuffer import rasterize
 from svim3d.render.deferred import Geometry, MaterialSource, SurfacePoints, surface_points
 from svim3d.shading.prefilter import EnvironmentPyramid
-from svim3d.shading.split_sum import shade
+from svim3d.shading.split_sum import Shading, shade
 
 SUPERSAMPLE = 2  # samples per pixel and axis
 EXPOSED_QUANTILE = 0.9  # of the luminance on the object that exposure brings to a chosen value
@@ -31,6 +31,7 @@ class ViewSamples:
 
     Attributes:
         pixel: flat index into V x H x W.
+        position: world frame.
         normal: unit shading normals, world frame.
         wo: unit directions to the viewer.
         basecolor: linear.
@@ -41,6 +42,7 @@ class ViewSamples:
     """
 
     pixel: Int[Tensor, "P"]
+    position: Float[Tensor, "P 3"]
     normal: Float[Tensor, "P 3"]
     wo: Float[Tensor, "P 3"]
     basecolor: Float[Tensor, "P 3"]
@@ -61,11 +63,9 @@ class ViewSamples:
         """Coverage."""
         return self.image(torch.ones_like(self.roughness))
 
-    def radiance(self, light: EnvironmentPyramid) -> Float[Tensor, "P 3"]:
-        """Linear radiance of all samples."""
-        return shade(
-            self.normal, self.wo, self.basecolor, self.roughness, self.metallic, light
-        ).radiance
+    def shading(self, light: EnvironmentPyramid) -> Shading:
+        """Linear radiance of all samples by lobe, as if nothing were in the way of the light."""
+        return shade(self.normal, self.wo, self.basecolor, self.roughness, self.metallic, light)
 
 
 def sample_views(
@@ -99,6 +99,7 @@ def sample_views(
     material = materials(points)
     return ViewSamples(
         pixel=torch.cat(pixel),
+        position=points.position,
         normal=normalize(points.normal + material.bump),
         wo=torch.cat(directions),
         basecolor=material.basecolor,
