@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch._dynamo import config as dynamo_config
 from torch.nn import functional
 
 from svim3d.diffusion.conditioning import Conditioning
@@ -68,6 +69,9 @@ class PreparedUNet:
         if compiled:
             for block in blocks:
                 block.compile(dynamic=False)
+        # All blocks share the code that is compiled; the full-size network has 18 shapes of them,
+        # where torch gives up after 8.
+        self._shapes_allowed = {"recompile_limit": max(8, len(blocks))} if compiled else {}
 
     @torch.no_grad()
     def bind(self, conditioning: Conditioning) -> BoundConditioning:
@@ -111,6 +115,18 @@ class PreparedUNet:
         shifts = iter(self._shifts(noise_level, bound.camera))
         clips = len(bound.picture) // len(noisy)
         hidden = self._first(noisy).repeat(clips, 1, 1, 1, 1) + bound.picture
+        with dynamo_config.patch(self._shapes_allowed):
+            hidden = self._walk(hidden, shifts, told)
+        hidden = functional.silu(group_norm(unet.conv_norm_out, hidden))
+        return conv(unet.conv_out, hidden).permute(0, 1, 4, 2, 3)
+
+    def _walk(
+        self,
+        hidden: Float[Tensor, "b k h w c"],
+        shifts: Iterator[Tensor],
+        told: Iterator[tuple[Tensor, ...]],
+    ) -> Float[Tensor, "b k h w c"]:
+        """Through all blocks, down and up again."""
         skips: list[Tensor] = []
         for kind, layer in self._steps:
             if kind == "keep":
@@ -125,8 +141,7 @@ class PreparedUNet:
                 hidden = conv(layer, hidden)
             else:
                 hidden = layer(hidden)
-        hidden = functional.silu(group_norm(unet.conv_norm_out, hidden))
-        return conv(unet.conv_out, hidden).permute(0, 1, 4, 2, 3)
+        return hidden
 
     def _first(self, noisy: Float[Tensor, "n k c h w"]) -> Float[Tensor, "n k h w o"]:
         """The first convolution's share of the noisy latents; the rest of it is bound."""
