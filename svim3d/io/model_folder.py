@@ -9,8 +9,9 @@ from pathlib import Path
 
 import torch
 
+from svim3d.diffusion.checkpoint import fill, require_fit
 from svim3d.diffusion.model import MaterialDiffusion, ModelSpec
-from svim3d.io.weights import load_tensors, save_tensors
+from svim3d.io.weights import open_tensors, save_tensors
 
 FORMAT = "svim3d-model/1"
 DESCRIPTION, CARD = "model.json", "README.md"
@@ -24,7 +25,12 @@ def write_model(
     for name, network in model.parts.items():
         tensors = {k: v.detach().to(dtype).contiguous() for k, v in network.state_dict().items()}
         save_tensors(folder / f"{name}.safetensors", tensors)
-    description = {"format": FORMAT, **asdict(model.spec)}
+    write_description(folder, model.spec, card)
+
+
+def write_description(folder: Path, spec: ModelSpec, card: str) -> None:
+    """Write all but the weights."""
+    description = {"format": FORMAT, **asdict(spec)}
     (folder / DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n")
     (folder / CARD).write_text(card)
 
@@ -69,39 +75,15 @@ def read_model(
         dtype: of the weights once read; sampling keeps its state in float32.
 
     Raises:
-        ValueError: missing, unexpected or misshapen tensors, named.
+        ValueError: a file that is missing or damaged; missing, unexpected or misshapen tensors,
+            named.
     """
     spec = read_spec(folder)
     with torch.device("meta"):
         model = MaterialDiffusion.untrained(spec)
     for name, network in model.parts.items():
-        tensors = load_tensors(folder / f"{name}.safetensors")
-        fill(network, {k: v.to(device, dtype) for k, v in tensors.items()}, name)
+        with open_tensors(folder / f"{name}.safetensors") as file:
+            require_fit(network, file.shapes, name)
+            fill(network, {k: file.read(k).to(device, dtype) for k in file.shapes}, name)
         network.eval().requires_grad_(False)
     return model
-
-
-def fill(network: torch.nn.Module, tensors: dict[str, torch.Tensor], what: str) -> None:
-    """Give a network on the meta device its weights.
-
-    Raises:
-        ValueError: names the first few missing, unexpected and misshapen tensors.
-    """
-    wanted = network.state_dict()
-    complaints = {
-        "missing": sorted(set(wanted) - set(tensors)),
-        "unexpected": sorted(set(tensors) - set(wanted)),
-        "of another shape": [
-            f"{name} {tuple(tensors[name].shape)} for {tuple(value.shape)}"
-            for name, value in wanted.items()
-            if name in tensors and tensors[name].shape != value.shape
-        ],
-    }
-    told = [
-        f"{len(names)} {kind} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
-        for kind, names in complaints.items()
-        if names
-    ]
-    if told:
-        raise ValueError(f"{what}: the tensors do not fit the network: {'; '.join(told)}")
-    network.load_state_dict(tensors, assign=True)
