@@ -216,7 +216,7 @@ def whole(w: Widths) -> Shapes:
 
 
 def filled(shapes: Shapes, seed: int = 0) -> dict[str, torch.Tensor]:
-    """Weights of the size that networks begin with; the second decoder copies the first."""
+    """Float32 weights as large as networks begin with; the second decoder copies the first."""
     tensors = dict(_drawn(shapes, torch.Generator().manual_seed(seed)))
     for name in shapes:
         if name.startswith(SECOND_DECODER):

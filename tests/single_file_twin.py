@@ -1,6 +1,7 @@
 """The networks of a single file in plain torch, fed with its tensors by its own names.
 
-Written from SV3D's description, block by block, and compared with the loaded networks.
+Written from SV3D's description, block by block, and compared with the loaded networks. All weights
+are wanted in float64.
 """
 
 import math
@@ -39,10 +40,11 @@ def layer_norm(t: Tensors, name: str, x: Tensor) -> Tensor:
 
 
 def sinusoids(x: Tensor, width: int) -> Tensor:
+    """In float32, as networks of any precision compute them."""
     half = width // 2
     frequency = torch.exp(-math.log(10000.0) * torch.arange(half) / half)
     angle = x[..., None].float() * frequency
-    return torch.cat([angle.cos(), angle.sin()], -1)
+    return torch.cat([angle.cos(), angle.sin()], -1).double()
 
 
 def mixed(t: Tensors, name: str, spatial: Tensor, temporal: Tensor) -> Tensor:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import torch
 
-from svim3d.diffusion.checkpoint import fill, require_fit
+from svim3d.diffusion.checkpoint import fill
 from svim3d.diffusion.model import MaterialDiffusion, ModelSpec
-from svim3d.io.weights import open_tensors, save_tensors
+from svim3d.io.weights import load_tensors, save_tensors
 
 FORMAT = "svim3d-model/1"
 DESCRIPTION, CARD = "model.json", "README.md"
@@ -82,8 +82,7 @@ def read_model(
     with torch.device("meta"):
         model = MaterialDiffusion.untrained(spec)
     for name, network in model.parts.items():
-        with open_tensors(folder / f"{name}.safetensors") as file:
-            require_fit(network, file.shapes, name)
-            fill(network, {k: file.read(k).to(device, dtype) for k in file.shapes}, name)
+        tensors = load_tensors(folder / f"{name}.safetensors")
+        fill(network, {k: v.to(device, dtype) for k, v in tensors.items()}, name)
         network.eval().requires_grad_(False)
     return model

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor
 
 Shape = tuple[int, ...]
@@ -25,9 +25,13 @@ def save_tensors(file: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 def load_tensors(file: Path) -> dict[str, Tensor]:
-    """Read all tensors of a file onto the CPU."""
-    tensors: dict[str, Tensor] = load_file(file)
-    return tensors
+    """All tensors of a file on the CPU, as pages of the file until they are written to.
+
+    Raises:
+        ValueError: see `open_tensors`.
+    """
+    with open_tensors(file) as opened:
+        return {name: opened.read(name) for name in opened.shapes}
 
 
 class TensorFile:
@@ -60,15 +64,13 @@ def open_tensors(file: Path) -> Iterator[TensorFile]:
     if not file.is_file():
         raise ValueError(f"there is no file {file}; check the path")
     try:
-        with file.open("rb") as stream:
-            start = stream.read(4)
-        if start == ZIP or start[:1] == PICKLE:
+        opened = safe_open(file, framework="pt")
+    except SafetensorError as error:
+        if _is_pickled(file):
             raise ValueError(
                 f"{file} is pickled, and unpickling can run any code: it is not opened; "
                 "wanted the .safetensors file of the same weights"
-            )
-        opened = safe_open(file, framework="pt")
-    except SafetensorError as error:
+            ) from error
         raise ValueError(
             f"{file} is no complete safetensors file ({error}); fetch or copy it again"
         ) from error
@@ -76,6 +78,12 @@ def open_tensors(file: Path) -> Iterator[TensorFile]:
         raise ValueError(f"{file} cannot be read: {error}") from error
     with opened:
         yield TensorFile(opened)
+
+
+def _is_pickled(file: Path) -> bool:
+    with file.open("rb") as stream:
+        start = stream.read(4)
+    return start == ZIP or start[:1] == PICKLE
 
 
 def save_one_by_one(
