@@ -17,7 +17,7 @@ from svim3d.diffusion.checkpoint import Kind, detect, require_cameras, require_f
 from svim3d.diffusion.inflation import Copies, Inflation
 from svim3d.diffusion.key_map import AUTOENCODER, SECOND_DECODER, Move, Sorted, sort_names
 from svim3d.diffusion.model import MaterialDiffusion, ModelSpec
-from svim3d.io.model_folder import CARD, read_spec, write_description
+from svim3d.io.model_folder import CARD, DESCRIPTION, read_spec, write_description
 from svim3d.io.weights import Shape, TensorFile, open_tensors, save_one_by_one
 
 PARTS = ("unet", "autoencoder", "image_encoder")
@@ -76,7 +76,7 @@ def convert(
     """
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(f"{out} is there already; choose another folder or remove it")
-    partial = out.with_name(f".{out.name}.partial")
+    partial = out.resolve().with_name(f".{out.resolve().name}.partial")
     try:
         with open_tensors(file) as tensors:
             spec, told = _convert(tensors, file, partial, groups, copies, dtype)
@@ -191,6 +191,8 @@ def describe(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
         raise InputError(f"{path} cannot be read: {error}") from error
     except ValueError as error:
         raise InputError(_naming(path, error)) from error
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: {DESCRIPTION} is damaged: {error!r}") from error
 
 
 def _describe_folder(folder: Path) -> tuple[list[tuple[str, str]], list[str]]:

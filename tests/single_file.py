@@ -4,8 +4,11 @@ Written from the published layout and not from `svim3d.diffusion.key_map`: names
 tensor, at any width.
 """
 
+import json
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
@@ -231,3 +234,20 @@ def _drawn(shapes: Shapes, generator: torch.Generator) -> Iterator[tuple[str, to
         fan_in = max(1, noise[0].numel()) if len(shape) > 1 else 25
         centre = float(name.endswith("weight") and len(shape) == 1)  # scales of norms
         yield name, centre + noise / fan_in**0.5
+
+
+def write_zeros(file: Path, shapes: Shapes, kind: str = "F8_E4M3") -> dict[str, int]:
+    """A file of these tensors, all 0, that takes no room on the disk; tells where each begins.
+
+    Eight-bit numbers keep even the full size within what a small machine maps.
+    """
+    size = {"F8_E4M3": 1, "F32": 4}[kind]
+    header, starts, end = {}, {}, 0
+    for name, shape in shapes.items():
+        starts[name], end = end, end + size * math.prod(shape)
+        header[name] = {"dtype": kind, "shape": shape, "data_offsets": [starts[name], end]}
+    text = json.dumps(header).encode()
+    with file.open("wb") as stream:
+        stream.write(len(text).to_bytes(8, "little") + text)
+        stream.truncate(8 + len(text) + end)
+    return {name: 8 + len(text) + start for name, start in starts.items()}
