@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flows.data_options import data_options
+from flows.model_options import model_options
 from flows.options import edit_options, job_options, relight_options
 from flows.train_options import train_options
 
@@ -71,6 +72,10 @@ def _dispatch(options: argparse.Namespace) -> int:
         from flows.data import data
 
         return data(options)
+    if options.command == "model":
+        from flows.model import model
+
+        return model(options)
     from flows import commands
 
     if options.command == "presets":
@@ -114,6 +119,7 @@ def _parser() -> argparse.ArgumentParser:
         ("edit", [edit_options(), shared], "write an asset with other materials"),
         ("train", [train_options(), shared], "train a generator on rendered examples"),
         ("data", [data_options(), shared], "render training data for the generator"),
+        ("model", [model_options(shared)], "convert a checkpoint, or tell what a model holds"),
         ("plan", [job, shared], "say which stages a run would compute, and why"),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),

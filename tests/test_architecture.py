@@ -93,6 +93,8 @@ LIGHT = (
     "flows.edit",
     "flows.engine",
     "flows.job",
+    "flows.model",
+    "flows.model_options",
     "flows.options",
     "flows.pipeline",
     "flows.plan",
