@@ -20,18 +20,20 @@ from stages.settings.training import TrainingConfig
 
 if TYPE_CHECKING:
     from stages.base import Progress
-    from stages.training_folder import TrainingFolder
-    from svim3d.diffusion.model import MaterialDiffusion
 
 TELL_EVERY_S = 30.0
-SHOWN_CLIPS = (0, 1)
+SHOWN_CLIPS = 2  # orbits on a sheet
 
 
 def train(options: argparse.Namespace) -> int:
     """Train what the command line names; see `svim3d train --help`."""
     config = load_training_config(options.config, options.set)
+    from stages.autoencoder_training import train_autoencoder
     from stages.execution import choose_device
+    from stages.generator_training import train_generator
+    from stages.latents import precompute_latents
     from stages.training_folder import TrainingFolder, examples_of, load_model_spec
+    from stages.training_sheet import draw_autoencoder_sheet, draw_generator_sheet
 
     examples = examples_of(options.data)
     spec = load_model_spec(options.model)
@@ -41,9 +43,32 @@ def train(options: argparse.Namespace) -> int:
     )
     folder.require_same(config, spec, options.data)
     interrupt_on_stop()
+    every_s = config.generator.checkpoint_every_s
     model = folder.start_model(spec, options.model)
-    model = _with_autoencoder(folder, model, examples, config)
-    _train_generator(folder, model, examples, config, options.minutes)
+    if not folder.has_autoencoder:
+        with folder.context("autoencoder", every_s) as ctx:
+            scale = train_autoencoder(model.autoencoder, examples, config.autoencoder, ctx)
+        sheet = folder.root / "autoencoder" / "sheet.png"
+        draw_autoencoder_sheet(model.autoencoder, examples[-1], sheet)
+        folder.keep_model(model.with_latent_scale(scale))
+        model = folder.reread_model()
+    with folder.context("latents", every_s) as ctx:
+        clips = precompute_latents(model, examples, folder.root / "latents", config.latents, ctx)
+    with folder.context("generator", every_s) as ctx:
+        train_generator(
+            model,
+            clips,
+            config.generator,
+            ctx,
+            on_checkpoint=lambda steps: folder.keep_model(model, steps=steps),
+            on_sheet=lambda steps: draw_generator_sheet(
+                model,
+                clips[:SHOWN_CLIPS],
+                folder.root / "generator" / f"sheet-{steps:07d}.png",
+                folder.seed,
+            ),
+            stop_after_s=None if options.minutes is None else 60.0 * options.minutes,
+        )
     console.print(f"{folder.model_folder}: a model for svim3d run --model", highlight=False)
     return DONE
 
@@ -61,54 +86,6 @@ def load_training_config(file: Path | None, overrides: Sequence[str]) -> Trainin
     if not isinstance(values, dict):
         raise InputError(f"{file}: wanted settings like 'generator: {{batch: 4}}'")
     return validated(TrainingConfig, values, overrides)
-
-
-def _with_autoencoder(
-    folder: "TrainingFolder",
-    model: "MaterialDiffusion",
-    examples: list[Path],
-    config: TrainingConfig,
-) -> "MaterialDiffusion":
-    """Train the autoencoder unless the model has one."""
-    from stages.autoencoder_training import train_autoencoder
-    from stages.training_sheet import draw_autoencoder_sheet
-
-    if folder.has_autoencoder:
-        return model
-    with folder.context("autoencoder", config.generator.checkpoint_every_s) as ctx:
-        scale = train_autoencoder(model.autoencoder, examples, config.autoencoder, ctx)
-    draw_autoencoder_sheet(model.autoencoder, examples[-1], folder.root / "autoencoder/sheet.png")
-    folder.keep_model(model.with_latent_scale(scale))
-    return folder.reread_model()
-
-
-def _train_generator(
-    folder: "TrainingFolder",
-    model: "MaterialDiffusion",
-    examples: list[Path],
-    config: TrainingConfig,
-    minutes: float | None,
-) -> None:
-    from stages.generator_training import train_generator
-    from stages.latents import precompute_latents
-    from stages.training_sheet import draw_generator_sheet
-    from svim3d.io.clip_file import read_clip
-
-    with folder.context("latents", config.generator.checkpoint_every_s) as ctx:
-        clips = precompute_latents(model, examples, folder.root / "latents", config.latents, ctx)
-    shown = [read_clip(clips[i]) for i in SHOWN_CLIPS if i < len(clips)]
-    with folder.context("generator", config.generator.checkpoint_every_s) as ctx:
-        train_generator(
-            model,
-            clips,
-            config.generator,
-            ctx,
-            on_checkpoint=lambda steps: folder.keep_model(model, steps=steps),
-            on_sheet=lambda steps: draw_generator_sheet(
-                model, shown, folder.root / f"generator/sheet-{steps:07d}.png", folder.seed
-            ),
-            stop_after_s=None if minutes is None else 60.0 * minutes,
-        )
 
 
 class _Teller:

@@ -1,5 +1,6 @@
 """Pictures by which a person follows a training run."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -8,10 +9,10 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from svim3d.diffusion.autoencoder import Autoencoder, decode, encode
-from svim3d.diffusion.clips import StoredClip
 from svim3d.diffusion.conditioning import Conditioning, camera_numbers, embed_picture
 from svim3d.diffusion.groups import as_network_input
 from svim3d.diffusion.model import MaterialDiffusion, Sampling
+from svim3d.io.clip_file import read_clip
 from svim3d.io.image import contact_sheet, write_png
 from svim3d.io.training_data import read_example
 
@@ -21,12 +22,12 @@ SCALE = 2  # pixels of the sheet per pixel of a picture
 
 
 def draw_generator_sheet(
-    model: MaterialDiffusion, clips: list[StoredClip], file: Path, seed: int
+    model: MaterialDiffusion, clips: Sequence[Path], file: Path, seed: int
 ) -> None:
     """Orbits of some clips, drawn from their reference views, under the truth."""
     rows: list[Tensor] = []
     labels: list[str] = []
-    for clip in clips:
+    for clip in map(read_clip, clips):
         truth = torch.cat([clip.rgb[0][None], clip.materials[int(clip.form[0])]]).float()
         shown = clip.pictures[0, -1].to(model.device).float() / 127.5 - 1.0
         camera = camera_numbers(clip.elevation_deg[0], clip.azimuth_deg[0], model.spec.cond_aug).to(
