@@ -129,7 +129,7 @@ def save_one_by_one(
             lacking.remove(name)
             written = _in_type(name, tensor, dtype)
             stream.seek(8 + len(text) + starts[name])
-            stream.write(written.reshape(-1).view(torch.uint8).numpy())
+            stream.write(written.reshape(-1).view(torch.uint8).numpy().data)
     if lacking:
         raise ValueError(f"{len(lacking)} tensors never came: {', '.join(sorted(lacking)[:3])}")
 
