@@ -20,11 +20,14 @@ DESCRIPTION, CARD = "model.json", "README.md"
 def write_model(
     folder: Path, model: MaterialDiffusion, card: str, dtype: torch.dtype = torch.float16
 ) -> None:
-    """Write all parts, the weights in `dtype`."""
+    """Write all parts, the weights in `dtype`; a model that was read from here stays whole."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, network in model.parts.items():
         tensors = {k: v.detach().to(dtype).contiguous() for k, v in network.state_dict().items()}
-        save_tensors(folder / f"{name}.safetensors", tensors)
+        # Read tensors are pages of their file, so that it is replaced and never written over.
+        temporary = folder / f"{name}.tmp"
+        save_tensors(temporary, tensors)
+        temporary.replace(folder / f"{name}.safetensors")
     write_description(folder, model.spec, card)
 
 
@@ -35,13 +38,13 @@ def write_description(folder: Path, spec: ModelSpec, card: str) -> None:
     (folder / CARD).write_text(card)
 
 
-def read_spec(folder: Path) -> ModelSpec:
-    """What a model folder says of itself.
+def read_spec(folder: Path, name: str = DESCRIPTION) -> ModelSpec:
+    """What a model folder says of itself, or a description of that name alone.
 
     Raises:
         ValueError: no model folder, or one of another format.
     """
-    file = folder / DESCRIPTION
+    file = folder / name
     if not file.is_file():
         raise ValueError(
             f"wanted a model folder with {DESCRIPTION}, {folder} has none; "
@@ -85,4 +88,7 @@ def read_model(
         tensors = load_tensors(folder / f"{name}.safetensors")
         fill(network, {k: v.to(device, dtype) for k, v in tensors.items()}, name)
         network.eval().requires_grad_(False)
+    # The one buffer that no file holds: the indices of the image encoder's patches.
+    embeddings = model.image_encoder.vision_model.embeddings
+    embeddings.position_ids = torch.arange(embeddings.num_positions, device=device)[None]
     return model

@@ -9,19 +9,42 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save, save_file
 from torch import Tensor
 
 Shape = tuple[int, ...]
 
 ZIP, PICKLE = b"PK\x03\x04", b"\x80"  # first bytes of what torch.save writes, now and formerly
+LENGTH_BYTES = 8  # a file begins with the length of its header, little endian
 HEADER_ALIGNMENT = 8  # bytes; readers map the numbers behind the header as they are
 TYPE_NAMES = {torch.float16: "F16", torch.bfloat16: "BF16", torch.float32: "F32"}
 
 
-def save_tensors(file: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Write named tensors; views and CUDA tensors are copied to contiguous CPU memory."""
-    save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, file)
+def save_tensors(
+    file: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write named tensors; views and CUDA tensors are copied to contiguous CPU memory.
+
+    Args:
+        file: overwritten if it is there.
+        tensors: by name.
+        metadata: texts that the file's header carries.
+    """
+    contiguous = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    if metadata is None:
+        save_file(contiguous, file)
+    else:
+        file.write_bytes(_with_sorted_header(save(contiguous, dict(metadata))))
+
+
+def _with_sorted_header(content: bytes) -> bytes:
+    """The same file with its header in order: the library shuffles metadata at every call."""
+    length = int.from_bytes(content[:LENGTH_BYTES], "little")
+    header = json.loads(content[LENGTH_BYTES : LENGTH_BYTES + length])
+    text = json.dumps(header, sort_keys=True, separators=(",", ":")).encode()
+    # Spaces keep the tensors behind it aligned.
+    text += b" " * (-len(text) % HEADER_ALIGNMENT)
+    return len(text).to_bytes(LENGTH_BYTES, "little") + text + content[LENGTH_BYTES + length :]
 
 
 def load_tensors(file: Path) -> dict[str, Tensor]:
@@ -34,16 +57,28 @@ def load_tensors(file: Path) -> dict[str, Tensor]:
         return {name: opened.read(name) for name in opened.shapes}
 
 
+def load_metadata(file: Path) -> dict[str, str]:
+    """The texts in a file's header; empty where there are none.
+
+    Raises:
+        ValueError: see `open_tensors`.
+    """
+    with open_tensors(file) as opened:
+        return opened.metadata
+
+
 class TensorFile:
     """Tensors that stay in their file until one is read; see `open_tensors`.
 
     Attributes:
         shapes: by name.
         types: by name, as the format calls them: F32, BF16 and so on.
+        metadata: texts in the file's header.
     """
 
     def __init__(self, opened: Any) -> None:
         self._opened = opened
+        self.metadata: dict[str, str] = dict(opened.metadata() or {})
         slices = {name: opened.get_slice(name) for name in opened.keys()}  # noqa: SIM118
         self.shapes: dict[str, Shape] = {n: tuple(s.get_shape()) for n, s in slices.items()}
         self.types: dict[str, str] = {n: str(s.get_dtype()) for n, s in slices.items()}
@@ -120,7 +155,7 @@ def save_one_by_one(
     text += b" " * (-len(text) % HEADER_ALIGNMENT)
     lacking = set(shapes)
     with file.open("wb") as stream:
-        stream.write(len(text).to_bytes(8, "little") + text)
+        stream.write(len(text).to_bytes(LENGTH_BYTES, "little") + text)
         for name, tensor in tensors:
             if name not in lacking or tuple(tensor.shape) != shapes[name]:
                 raise ValueError(
@@ -128,7 +163,7 @@ def save_one_by_one(
                 )
             lacking.remove(name)
             written = _in_type(name, tensor, dtype)
-            stream.seek(8 + len(text) + starts[name])
+            stream.seek(LENGTH_BYTES + len(text) + starts[name])
             stream.write(written.reshape(-1).view(torch.uint8).numpy().data)
     if lacking:
         raise ValueError(f"{len(lacking)} tensors never came: {', '.join(sorted(lacking)[:3])}")
