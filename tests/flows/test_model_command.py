@@ -6,6 +6,7 @@ import struct
 
 import pytest
 import single_file
+import single_file_twin as twin
 import torch
 from safetensors.torch import load_file, save_file
 
@@ -101,6 +102,24 @@ def test_copies_types_and_groups_are_as_asked_for(file, tensors, tmp_path):
     unet = load_file(tmp_path / "one" / "unet.safetensors")
     assert torch.equal(unet["conv_in.weight"], tensors[FIRST].bfloat16())
     assert json.loads((tmp_path / "one" / "model.json").read_text())["groups"] == ["rgb"]
+
+
+@torch.no_grad()
+def test_the_loaded_model_answers_in_each_group_as_the_file_would(file, tensors, tmp_path):
+    assert model("convert", file, tmp_path / "out", "--dtype", "fp32") == cli.DONE
+    loaded = read_model(tmp_path / "out", torch.device("cpu"), torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    noisy, reference = torch.randn(
+        2, 1, 2, 4, 8, 8, generator=generator, dtype=torch.float64
+    ).unbind()
+    token = torch.randn(1, 32, generator=generator, dtype=torch.float64)
+    camera, level = torch.rand(1, 2, 3, generator=generator), torch.tensor([0.4])
+    unet = {n: t.double() for n, t in twin.under(tensors, single_file.UNET).items()}
+    expected = twin.unet(unet, torch.cat([noisy, reference], 2), level, token, camera)
+    given = torch.cat([*[noisy] * 4, reference], 2)
+    for group in loaded.unet(given, level, token[:, None], camera).split(4, 2):
+        # The only rounding is that of float64 sums: a quarter of a float32 number is one.
+        torch.testing.assert_close(group, expected, rtol=0.0, atol=1e-10)
 
 
 def test_a_file_is_told_of_by_its_header(tmp_path, capsys):
