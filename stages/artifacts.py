@@ -38,6 +38,7 @@ class MaterialViews:
         normal_world: unit shading normals, straight.
         reference: index of the view at azimuth 0 that the asset was asked for by.
         depth: distance along the camera's -z axis, zero where nothing is; None where nobody knows.
+        confidence: how far each pixel is to be trusted, in [0, 1]; None means all of them wholly.
     """
 
     cameras: Cameras
@@ -49,9 +50,12 @@ class MaterialViews:
     normal_world: Float[Tensor, "V H W 3"]
     reference: int
     depth: Float[Tensor, "V H W 1"] | None = None
+    confidence: Float[Tensor, "V H W 1"] | None = None
 
     def premultiplied(self, longest_px: int) -> tuple[Cameras, dict[str, Tensor]]:
         """What an optimisation compares renders with: images times coverage, cameras to match.
+
+        Where there is `confidence`, it comes with them as it is: a weight for each pixel's losses.
 
         Args:
             longest_px: larger views are averaged down to at most this size; the whole picture stays
@@ -64,6 +68,7 @@ class MaterialViews:
             "roughness": self.roughness * self.mask,
             "metallic": self.metallic * self.mask,
             "normal_world": normalize(self.normal_world) * self.mask,
+            **({} if self.confidence is None else {"confidence": self.confidence}),
         }
         factor = -(-max(self.cameras.height, self.cameras.width) // longest_px)
         height, width = self.cameras.height // factor, self.cameras.width // factor
@@ -84,6 +89,7 @@ class MaterialViews:
                 "metallic": self.metallic,
                 "normal_world": self.normal_world,
                 **({} if self.depth is None else {"depth": self.depth}),
+                **({} if self.confidence is None else {"confidence": self.confidence}),
             },
             reference=self.reference,
         )

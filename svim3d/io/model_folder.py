@@ -3,6 +3,7 @@
 The folder is complete in itself: nothing is fetched, nothing is pickled.
 """
 
+import importlib.resources
 import json
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -14,6 +15,22 @@ from svim3d.io.weights import load_tensors, save_tensors
 
 FORMAT = "svim3d-model/1"
 DESCRIPTION, CARD = "model.json", "README.md"
+BUNDLED = "models/svim3d-small"  # inside the package
+
+
+def bundled_model() -> Path:
+    """The folder of the model that comes with the program.
+
+    Raises:
+        ValueError: this copy of the program has none.
+    """
+    folder = Path(str(importlib.resources.files("svim3d") / BUNDLED))
+    if not (folder / DESCRIPTION).is_file():
+        raise ValueError(
+            f"wanted the bundled model in {folder}, this copy of the program came without it; "
+            "install it anew, or name a model folder with --model"
+        )
+    return folder
 
 
 def write_model(
@@ -77,8 +94,20 @@ def read_model(
     for name, network in model.parts.items():
         tensors = load_tensors(folder / f"{name}.safetensors")
         fill(network, {k: v.to(device, dtype) for k, v in tensors.items()}, name)
+        _number_positions(network, device)
         network.eval().requires_grad_(False)
     return model
+
+
+def _number_positions(network: torch.nn.Module, device: torch.device) -> None:
+    """Give CLIP's embedding the numbers of its positions, which are in no file and still on meta.
+
+    Any other such buffer would be noticed: the first use of a tensor on meta fails.
+    """
+    for module in network.modules():
+        positions = getattr(module, "position_ids", None)
+        if isinstance(positions, torch.Tensor) and positions.is_meta:
+            module.position_ids = torch.arange(positions.shape[-1], device=device)[None]
 
 
 def fill(network: torch.nn.Module, tensors: dict[str, torch.Tensor], what: str) -> None:
