@@ -18,6 +18,7 @@ from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
 from svim3d.io.exr import read_rgb, write_rgb
 from svim3d.io.image import read_png, write_png
 from svim3d.io.orbit import read_orbit, write_orbit
+from svim3d.io.orbit_sheet import orbit_sheet
 from svim3d.io.weights import load_tensors, save_tensors
 from svim3d.mesh.marching import extract_surface
 from svim3d.numerics import normalize
@@ -77,22 +78,10 @@ class MaterialViews:
         return self.cameras.resized(height, width), planes
 
     def save(self, folder: Path) -> None:
-        """Write an orbit folder (the exchange format, see README)."""
-        write_orbit(
-            folder,
-            self.cameras,
-            {
-                "radiance": self.radiance,
-                "mask": self.mask,
-                "basecolor": self.basecolor,
-                "roughness": self.roughness,
-                "metallic": self.metallic,
-                "normal_world": self.normal_world,
-                **({} if self.depth is None else {"depth": self.depth}),
-                **({} if self.confidence is None else {"confidence": self.confidence}),
-            },
-            reference=self.reference,
-        )
+        """Write an orbit folder (the exchange format, see README) and a sheet to look at."""
+        known = {name: v for name, v in vars(self).items() if isinstance(v, Tensor)}
+        write_orbit(folder, self.cameras, known, reference=self.reference)
+        write_png(folder / "views.png", orbit_sheet(self.cameras, known))
 
     @classmethod
     def load(cls, folder: Path) -> Self:

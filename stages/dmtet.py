@@ -143,8 +143,7 @@ def _image_losses(
     trust = target.get("confidence")
     guide = ray_losses.smoothing_guide(target["radiance"], trust)
     return {
-        "mask": config.mask_weight
-        * ray_losses.squared_loss(rendered.mask, target["mask"], trust),
+        "mask": config.mask_weight * ray_losses.squared_loss(rendered.mask, target["mask"], trust),
         "basecolor": config.basecolor_weight
         * ray_losses.color_loss(rendered.basecolor, target["basecolor"], trust),
         "orm": config.orm_weight

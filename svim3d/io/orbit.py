@@ -2,9 +2,10 @@
 
 `orbit.json` holds `camera` {width, height, fov_deg (vertical)}, the frames and the reference;
 each frame names a multi-channel half-float EXR. Radiance (`R G B`) is premultiplied by the
-coverage `A`; basecolor, roughness, metallic and the world normal are straight. Depth and confidence
-may be there or not. Two layouts are read: `frames` with `reference` as an index (what `write_orbit` makes), and
-the layout of benchmark sets: `train`, and `test` whose frames name one file per environment.
+coverage `A`; basecolor, roughness, metallic and the world normal are straight. Depth and a
+confidence may be there or not. Two layouts are read: `frames` with `reference` as an index (what
+`write_orbit` makes), and the layout of benchmark sets: `train`, and `test` whose frames name one
+file per environment.
 """
 
 import contextlib

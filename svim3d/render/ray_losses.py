@@ -1,8 +1,8 @@
 """Losses on blocks of 2 x 2 composited rays against premultiplied target pixels.
 
-All are means over the batch and of order one when the prediction is useless. A confidence weighs the
-pixels of what compares with a target: where it is low the mean falls too, and the regularisers, which
-take none, have their way.
+All are means over the batch and of order one when the prediction is useless. A confidence weighs
+the pixels of what compares with a target: where it is low the mean falls too, and the regularisers,
+which take none, have their way.
 """
 
 import math
