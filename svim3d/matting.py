@@ -40,6 +40,7 @@ ROBUST_ITERATIONS = 20
 ROBUST_START, ROBUST_END = 0.2, 0.01  # Oklab; width of the weights at the first and last iteration
 MAD_TO_SIGMA = 1.4826  # of a normal distribution
 MIN_TOLERANCE, MAX_TOLERANCE = 0.035, 0.10  # Oklab; a just noticeable difference is about 0.02
+MAX_SCATTER = 0.05  # Oklab; a border of more is a pattern, not noise
 NOISE_TOLERANCE = 4.0  # standard deviations of the border about its gradient
 MIN_PLAIN_SHARE = 0.6  # of the border; an object may be cut off at one side
 DRIFT_ITERATIONS = 3  # of widening the background and following it where it leaves the gradient
@@ -50,15 +51,20 @@ SHADOW_CHROMA = 0.02  # Oklab; a shadow keeps the background's hue, up to a tint
 SHADOW_SLOPE = 0.012  # Oklab per pixel; object edges are steeper
 SHADOW_GAP_PX = 2  # what is narrower is no way for a shadow into the object
 MIN_OBJECT_SHARE, MAX_OBJECT_SHARE = 0.0005, 0.95  # of the picture's pixels
+SIDE_SHARE = 0.1  # of a side's pixels; an object that takes more is cut off there
 SPECK_PX = 12  # fewer pixels than this are noise
-HOLE_SHARE = 0.002  # of the object; smaller enclosed patches of background are highlights
-CLIPPED = 0.985  # sRGB; white beyond this may be a highlight, a label, or the background
-EDGE_SHARE = 1.0 / 400.0  # half width of a soft edge, of the picture's longer side
-MIN_EDGE_PX, MAX_EDGE_PX = 2, 5
+HOLE_SHARE = 0.004  # of the object; smaller enclosed patches of background are highlights
+HOLE_DIFFERENCE = 0.35  # root mean square difference of a hole from the background, of tolerances
+MAX_EDGE_DEPTH_PX = 4  # inside the outline, up to which pixels may be mixtures; found by looking
+EDGE_MARGIN_PX = 2  # outside the outline, within which they may be
 EDGE_CONTRAST = 0.02  # linear light; below this mixtures cannot be told from noise
+PATTERN_WEIGHT = 4.0  # of the colours' variance nearby, against the contrast across the edge
+CLEARLY_TOLD = 0.8  # weight of a mixture beyond which it says how soft the edges are
+ALL_OBJECT = 0.9  # a mixture of this share of object is taken for the object alone
 MIN_WEIGHT = 1e-4  # protects divisions by local weights
 FUSION_RADII_PX = (90, 6)  # Source: Forte 2021, "Approximate fast foreground colour estimation"
 GUIDE_SIDE_PX = 512  # the guided filter's coefficients are smooth: found on a small picture
+TAIL = 0.1  # faint mist that the filter leaves on both sides of an edge
 GUIDE_NOISE = 1e-4  # variance of the guide that is smoothed over; Source: He et al. 2013
 
 
@@ -89,7 +95,7 @@ def cut_out_plain(rgb_srgb: Float[Tensor, "H W 3"], notify: Notify) -> Float[Ten
     _refuse_extremes(inside)
     if shadow.sum() > MIN_OBJECT_SHARE * shadow.size:
         notify("shadow_removed", "a soft shadow was taken for background")
-    holes = _holes(lab, backdrop, inside, tolerance, rgb_srgb.numpy(), notify)
+    holes = _holes(lab, backdrop, inside, tolerance, notify)
     return _soft_edge(linear.numpy(), inside & ~holes)
 
 
@@ -126,11 +132,16 @@ def fit_backdrop(
         residual = np.linalg.norm(seen - rows @ coefficients, axis=1)
     plain = residual < MAX_TOLERANCE
     share = float(plain.mean())
-    scatter = MAD_TO_SIGMA * float(np.median(residual[plain])) if share > 0 else np.inf
-    if share < MIN_PLAIN_SHARE or NOISE_TOLERANCE * scatter > 2.0 * MAX_TOLERANCE:
+    scatter = MAD_TO_SIGMA * float(np.median(residual[plain])) if plain.any() else 0.0
+    if share < MIN_PLAIN_SHARE:
         raise ValueError(
             f"wanted a plain background, but only {100 * share:.0f} % of the picture's border is "
             f"of one colour or gradient (the object touches it, or the scene is busy); {ADVICE}"
+        )
+    if scatter > MAX_SCATTER:
+        raise ValueError(
+            "wanted a plain background, but the picture's border is no even colour or gradient: "
+            f"it scatters by {scatter:.2f}, more than {MAX_SCATTER}, in Oklab; {ADVICE}"
         )
     tolerance = float(np.clip(NOISE_TOLERANCE * scatter, MIN_TOLERANCE, MAX_TOLERANCE))
     return (basis @ coefficients).astype(np.float32), tolerance
@@ -158,7 +169,7 @@ def _flood(
         weight = _local_mean(behind[..., None].astype(np.float32), radius)
         drift = _local_mean((lab - gradient) * behind[..., None], radius)
         # Where no background is near, the gradient is all that is known.
-        backdrop = gradient + drift / np.maximum(weight, LEAST_WEIGHT)
+        backdrop = (gradient + drift / np.maximum(weight, LEAST_WEIGHT)).astype(np.float32)
     return behind, backdrop
 
 
@@ -204,14 +215,13 @@ def _soft_shadow(
 def _without_specks(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Drop regions of a few pixels, which noise makes."""
     label, count = ndimage.label(inside, np.ones((3, 3)))
-    sizes = np.bincount(label.ravel(), minlength=count + 1)
-    kept = sizes >= SPECK_PX
+    kept = np.bincount(label.ravel(), minlength=count + 1) >= SPECK_PX
     kept[0] = False
     return kept[label]
 
 
 def _refuse_extremes(inside: NDArray[np.bool_]) -> None:
-    """Raise where nothing or nearly everything stands out."""
+    """Raise where nothing or nearly everything stands out, or something from side to side."""
     share = float(inside.mean())
     if share < MIN_OBJECT_SHARE:
         raise ValueError(f"nothing stands out from the plain background; {ADVICE}")
@@ -220,6 +230,13 @@ def _refuse_extremes(inside: NDArray[np.bool_]) -> None:
             f"{100 * share:.0f} % of the picture differ from its border's colour: no background "
             f"is left to tell the object from; {ADVICE}"
         )
+    sides = (inside[0], inside[-1], inside[:, 0], inside[:, -1])
+    reached = [float(side.mean()) > SIDE_SHARE for side in sides]
+    if (reached[0] and reached[1]) or (reached[2] and reached[3]):
+        raise ValueError(
+            "what stands out from the border's colour reaches two opposite sides of the picture: "
+            f"that is a scene or a bar across it, not an object; {ADVICE}"
+        )
 
 
 def _holes(
@@ -227,64 +244,75 @@ def _holes(
     backdrop: NDArray[np.float32],
     inside: NDArray[np.bool_],
     tolerance: float,
-    rgb_srgb: NDArray[np.float32],
     notify: Notify,
 ) -> NDArray[np.bool_]:
-    """Background seen through the object: enclosed patches of just its colour."""
+    """Background seen through the object: enclosed patches of just its colour.
+
+    A label or a highlight may come near that colour, but it is seldom as even.
+    """
     smooth = ndimage.uniform_filter(lab, (3, 3, 1))
-    alike = inside & (np.linalg.norm(smooth - backdrop, axis=-1) < tolerance)
-    label, count = ndimage.label(alike)
+    difference = np.linalg.norm(smooth - backdrop, axis=-1)
+    label, count = ndimage.label(inside & (difference < tolerance))
     sizes = np.bincount(label.ravel(), minlength=count + 1)
-    large = sizes >= max(SPECK_PX, HOLE_SHARE * inside.sum())
-    large[0] = False
-    patches = large[label]
-    if not patches.any():
-        return patches
-    if float(np.median(rgb_srgb[patches].min(-1))) > CLIPPED:
+    squares = np.bincount(label.ravel(), (difference**2).ravel(), minlength=count + 1)
+    even = np.sqrt(squares / np.maximum(sizes, 1)) < HOLE_DIFFERENCE * tolerance
+    holes = even & (sizes >= max(SPECK_PX, HOLE_SHARE * inside.sum()))
+    holes[0] = False
+    if holes.any():
         notify(
-            "holes_kept",
-            f"{int(large.sum())} white patches inside the object may be background seen through "
-            "it: kept; give a picture with the object cut out if they are",
+            "seen_through",
+            f"{int(holes.sum())} patches inside the object have just the background's colour: "
+            "taken for holes; give a picture with the object cut out if they are none",
         )
-        return np.zeros_like(patches)
-    return patches
+    return holes[label]
 
 
 def _soft_edge(linear: NDArray[np.float32], inside: NDArray[np.bool_]) -> Float[Tensor, "H W 1"]:
     """Coverage along the outline, from how each pixel mixes the colours on its two sides.
 
-    A pixel is I = a F + (1 - a) B; F and B are means of what is surely object and background near
-    it. Where the two are alike, or the object is thinner than the band, the region's own outline
-    stays.
+    How far inside the outline pixels are mixtures is the same all around: beyond that, a pixel like
+    the background is the object's own pattern.
     """
-    reach = int(np.clip(round(EDGE_SHARE * max(inside.shape)), MIN_EDGE_PX, MAX_EDGE_PX))
     signed = np.where(
         inside, ndimage.distance_transform_edt(inside), -ndimage.distance_transform_edt(~inside)
     )
-    # The region was drawn at the faintest difference, a pixel or so outside the true edge.
-    lowest = np.clip((signed - 1.5) / reach, 0.0, 1.0)
-    highest = np.clip(1.0 + signed / reach, 0.0, 1.0)
-    front = _nearby_colour(linear, lowest >= 1.0, reach + 1)
-    back = _nearby_colour(linear, highest <= 0.0, reach + 1)
-    difference = front[0] - back[0]
-    contrast = (difference**2).sum(-1)
-    mixed = ((linear - back[0]) * difference).sum(-1) / np.maximum(contrast, 1e-8)
-    known = contrast / (contrast + EDGE_CONTRAST**2) * front[1] * back[1]
-    outline = ndimage.gaussian_filter(inside.astype(np.float32), 0.7)
-    coverage = np.clip(known * np.clip(mixed, 0.0, 1.0) + (1.0 - known) * outline, lowest, highest)
+    back, back_variance, has_back = _nearby_colour(
+        linear, signed <= -EDGE_MARGIN_PX, EDGE_MARGIN_PX
+    )
+    for depth in range(1, MAX_EDGE_DEPTH_PX + 1):
+        front, front_variance, has_front = _nearby_colour(linear, signed > depth, depth)
+        axis = front - back
+        contrast = (axis**2).sum(-1)
+        mixed = ((linear - back) * axis).sum(-1) / np.maximum(contrast, EDGE_CONTRAST**2)
+        noise = EDGE_CONTRAST**2 + PATTERN_WEIGHT * (front_variance + back_variance)
+        told = np.where(has_front & has_back, contrast / (contrast + noise), 0.0)
+        shell = (told > CLEARLY_TOLD) & (np.abs(signed - depth) < 0.5)
+        if shell.any() and float(np.median(mixed[shell])) > ALL_OBJECT:
+            break
+    # Where pattern hides the mixture, the edge lies where it does elsewhere.
+    outline = np.clip(0.5 * (signed - depth) + 1.0, 0.0, 1.0)
+    # Parts too thin to have a sure inside: the most different pixel nearby is all object.
+    away = np.sqrt(((linear - back) ** 2).sum(-1))
+    thin = away / np.maximum(ndimage.maximum_filter(away, 2 * EDGE_MARGIN_PX + 1), EDGE_CONTRAST)
+    outline = np.where(has_back & ~has_front, thin, outline)
+    coverage = told * np.clip(mixed, 0.0, 1.0) + (1.0 - told) * outline
+    lowest = np.where(has_front, np.clip(signed - depth + 0.5, 0.0, 1.0), 0.0)
+    highest = np.clip(1.0 + signed / EDGE_MARGIN_PX, 0.0, 1.0)
+    coverage = np.clip(coverage, lowest, highest)
     return torch.from_numpy(coverage.astype(np.float32))[..., None]
 
 
 def _nearby_colour(
     linear: NDArray[np.float32], sure: NDArray[np.bool_], reach: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean colour [H, W, 3] of sure pixels nearby, and whether there were any, [H, W]."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Of sure pixels nearby: mean colour [H, W, 3], variance [H, W], whether there were any."""
     sigma = (reach, reach, 0)
     weight = ndimage.gaussian_filter(sure[..., None].astype(np.float32), sigma)
-    total = ndimage.gaussian_filter(linear * sure[..., None], sigma)
-    return total / np.maximum(weight, MIN_WEIGHT), (weight[..., 0] > 10 * MIN_WEIGHT).astype(
-        np.float32
-    )
+    weight = np.maximum(weight, MIN_WEIGHT)
+    mean = ndimage.gaussian_filter(linear * sure[..., None], sigma) / weight
+    square = ndimage.gaussian_filter((linear**2).sum(-1) * sure, reach) / weight[..., 0]
+    variance = np.maximum(square - (mean**2).sum(-1), 0.0)
+    return mean, variance, weight[..., 0] > 10.0 * MIN_WEIGHT
 
 
 def foreground_colour(
@@ -345,7 +373,7 @@ def sharpen_coverage(
     smooth = _box(torch.cat([slope, offset], -1), radius).float().permute(2, 0, 1)[None]
     full = interpolate(smooth, size=(height, width), mode="bilinear")[0].permute(1, 2, 0)
     sharp = (full[..., :3] * rgb_srgb).sum(-1, keepdim=True) + full[..., 3:]
-    return sharp.clamp(0.0, 1.0)
+    return ((sharp - TAIL) / (1.0 - 2.0 * TAIL)).clamp(0.0, 1.0)
 
 
 def _box(values: Float[Tensor, "H W C"], radius: int) -> Float[Tensor, "H W C"]:

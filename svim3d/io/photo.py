@@ -21,7 +21,7 @@ from svim3d.io.limits import check_size
 Notify = Callable[[str, str], None]
 
 # Named, because other decoders of Pillow start programs or fetch things.
-FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "GIF")
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")
 WANTED = "wanted a photo (PNG, JPEG, WebP, TIFF, BMP or GIF)"
 MAX_8BIT, MAX_16BIT = 255.0, 65535
 OPACITY_MODES = ("LA", "La", "PA", "RGBA", "RGBa")
