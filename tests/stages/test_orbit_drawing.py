@@ -32,7 +32,9 @@ def perfect(monkeypatch):
 
     def decode(self, latents, sampling):
         sphere = drawn_sphere(VIEWS, SIZE)
-        return replace(sphere, basecolor=sphere.basecolor * (1.0 - 0.1 * latents.std().sigmoid()))
+        # Far digits of the latents: as good as random, and the same for the same seed.
+        shade = 1.0 - 0.3 * (1000.0 * latents[0, 0, 0, 0]).remainder(1.0)
+        return replace(sphere, basecolor=sphere.basecolor * shade)
 
     monkeypatch.setattr(MaterialDiffusion, "decode", decode)
 
@@ -118,7 +120,7 @@ def test_of_several_samples_one_is_kept_with_its_confidence(perfect, draw, make_
     assert views.confidence is not None
     outside = views.mask == 0.0
     assert bool((views.confidence[outside] == 1.0).all())
-    assert 0.9 < float(views.confidence[views.mask == 1.0].min()) < 1.0
+    assert 0.5 < float(views.confidence[views.mask == 1.0].min()) < 1.0
     assert "sample" in make_context("generation").events[-1]["message"]
     views.save(tmp_path / "saved")
     assert torch.equal(MaterialViews.load(tmp_path / "saved").confidence, views.confidence)
@@ -132,7 +134,7 @@ def test_views_without_an_object_are_refused_with_advice(draw, monkeypatch):
         return replace(sphere, mask=torch.ones_like(sphere.mask))
 
     monkeypatch.setattr(MaterialDiffusion, "decode", decode)
-    with pytest.raises(InputError, match="cannot be used .*try another --seed"):
+    with pytest.raises(InputError, match=r"cannot be used .*try another --seed"):
         draw()
 
 
