@@ -11,7 +11,10 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
+from flows.data_options import data_options
+from flows.model_options import model_options
 from flows.options import edit_options, job_options, photo_settings, relight_options
+from flows.train_options import train_options
 
 DONE, FAILED, BAD_INPUT, CANCELLED = 0, 1, 2, 130
 DEFAULT_STORE = Path(".svim3d")
@@ -61,6 +64,18 @@ def _dispatch(options: argparse.Namespace) -> int:
         from flows.edit import edit
 
         return edit(options)
+    if options.command == "train":
+        from flows.train import train
+
+        return train(options)
+    if options.command == "data":
+        from flows.data import data
+
+        return data(options)
+    if options.command == "model":
+        from flows.model import model
+
+        return model(options)
     from flows import commands
 
     if options.command == "presets":
@@ -102,6 +117,9 @@ def _parser() -> argparse.ArgumentParser:
         ("run", [job, shared], "make the asset; finished stages are taken from the store"),
         ("relight", [relight_options(), shared], "show views or an asset under another light"),
         ("edit", [edit_options(), shared], "write an asset with other materials"),
+        ("train", [train_options(), shared], "train a generator on rendered examples"),
+        ("data", [data_options(), shared], "render training data for the generator"),
+        ("model", [model_options(shared)], "convert a checkpoint, or tell what a model holds"),
         ("plan", [job, shared], "say which stages a run would compute, and why"),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),

@@ -1,5 +1,6 @@
 """Settings of a run: defaults in the code, then a preset, then overrides from the command line."""
 
+import copy
 import dataclasses
 import difflib
 import importlib.resources
@@ -55,6 +56,7 @@ class RelightRunConfig(RunConfig):
 
 
 ConfigT = TypeVar("ConfigT", bound=RunConfig)
+SettingsT = TypeVar("SettingsT", bound=BaseModel)
 
 
 def load_config(
@@ -72,10 +74,7 @@ def load_config(
         InputError: an unknown name (with the nearest valid ones) or a value out of bounds.
     """
     values = preset_values(preset)
-    for override in overrides:
-        path, value = _parse_override(override)
-        _require_known(schema, path, origin="--set")
-        _set(values, path, value)
+    _override(schema, values, overrides)
     left_out = values.get("skip", [])
     if not isinstance(left_out, list):
         raise InputError(f"--set skip={left_out}: wanted a list of stages, like skip=[dmtet]")
@@ -83,14 +82,26 @@ def load_config(
     return validated(schema, values)
 
 
-def validated(schema: type[ConfigT], values: Mapping[str, Any]) -> ConfigT:
-    """Settings made of nested names and values.
+def _override(schema: type[BaseModel], values: dict[str, Any], overrides: Sequence[str]) -> None:
+    """Change nested values as `--set` says."""
+    for override in overrides:
+        path, value = _parse_override(override)
+        _require_known(schema, path, origin="--set")
+        _set(values, path, value)
+
+
+def validated(
+    schema: type[SettingsT], values: Mapping[str, Any], overrides: Sequence[str] = ()
+) -> SettingsT:
+    """Settings made of nested names and values, then of `key.path=value` overrides.
 
     Raises:
         InputError: an unknown name (with the nearest valid ones) or a value out of bounds.
     """
+    changed = copy.deepcopy(dict(values))
+    _override(schema, changed, overrides)
     try:
-        return schema.model_validate(values)
+        return schema.model_validate(changed)
     except ValidationError as error:
         raise InputError(_in_short(error, schema)) from error
 
@@ -147,7 +158,7 @@ def _parse_override(override: str) -> tuple[str, Any]:
         raise InputError(f"--set {override!r}: the value is no YAML; quote it") from error
 
 
-def _require_known(schema: type[RunConfig], path: str, *, origin: str) -> None:
+def _require_known(schema: type[BaseModel], path: str, *, origin: str) -> None:
     names = setting_names(schema)
     if path in names:
         return
@@ -173,7 +184,7 @@ def _set(values: dict[str, Any], path: str, value: Any) -> None:
     values[name] = value
 
 
-def _in_short(error: ValidationError, schema: type[RunConfig]) -> str:
+def _in_short(error: ValidationError, schema: type[BaseModel]) -> str:
     """A validation error in one line, with suggestions for unknown names."""
     problems = []
     for problem in error.errors(include_url=False):

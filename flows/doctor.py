@@ -20,6 +20,7 @@ LIBRARIES = ("torch", "numpy", "numba", "OpenEXR", "pymeshlab", "xatlas", "prefe
 OPTIONAL = {
     "mitsuba": "svim3d relight --engine path",
     "imageio_ffmpeg": "svim3d relight --turntable mp4, unless ffmpeg is on the path",
+    "onnxruntime": "svim3d run on photos with any background: a matting network",
     "matplotlib": "charts of the benchmarks",
     "pytest": "the tests",
 }

@@ -49,8 +49,7 @@ class Job:
             compute: what runs the steps; returns the artifacts and what it adds to `run.json`.
         """
         require_ours(self.out, plan.pipeline)
-        # A stop by the system must leave the same resumable state as Ctrl-C.
-        signal.signal(signal.SIGTERM, _interrupt)
+        interrupt_on_stop()
         if plan.to_compute:
             artifacts, told = compute(plan, self)
         else:
@@ -112,6 +111,11 @@ def compute_here(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[str, Any
             if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):
                 artifacts[step.node.name] = obtain_step(step, artifacts, bench)
     return artifacts, {}
+
+
+def interrupt_on_stop() -> None:
+    """Let a stop by the system leave the same resumable state as Ctrl-C."""
+    signal.signal(signal.SIGTERM, _interrupt)
 
 
 def _interrupt(signal_number: int, frame: FrameType | None) -> None:

@@ -118,6 +118,7 @@ class Context:
         shared: folder for derived data that runs may share (content-addressed by its users).
         on_progress: called at most a few times a second.
         events: fallbacks taken, views dropped, steps skipped; they end up in the manifest.
+        checkpoint_every_s: how often a long stage saves its state.
     """
 
     stage: str
@@ -127,11 +128,13 @@ class Context:
     shared: Path
     on_progress: Callable[[Progress], None] | None = None
     events: list[dict[str, str]] = field(default_factory=list)
+    checkpoint_every_s: float = CHECKPOINT_EVERY_S
 
     def __post_init__(self) -> None:
         self.work.mkdir(parents=True, exist_ok=True)
         self.checkpoints = Checkpoints(
             self.work,
+            self.checkpoint_every_s,
             before_save=self._flush_scalars,
             after_load=lambda: self.event(
                 "resumed", "went on from a checkpoint of an interrupted run"

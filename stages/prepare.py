@@ -17,8 +17,9 @@ from stages.settings.prepare import PrepareConfig
 from svim3d.color import linear_from_srgb, srgb_from_linear
 from svim3d.io.matting_network import FETCH, find_network, network_coverage
 from svim3d.io.photo import Photo, read_photo
-from svim3d.matting import cut_out_plain, foreground_colour, sharpen_coverage
+from svim3d.matting import cut_out_plain
 from svim3d.placement import Box, bounding_box, centred_square, drop_specks
+from svim3d.unmixing import foreground_colour, sharpen_coverage
 
 LONGEST_PX = 2048  # of a photo as it is worked on: an object of a quarter of it fills 576 pixels
 NETWORK_BLUR = 1.0 / 80.0  # of the longer side: four pixels of the 320 that a network sees

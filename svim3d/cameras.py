@@ -6,6 +6,7 @@ World: right-handed, y up. Camera: OpenGL axes (x right, y up, looks down -z). P
 
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from jaxtyping import Float, Int
@@ -126,6 +127,52 @@ def orbit_angles(
         (mean_elevation_deg + elevation_swing_deg * math.sin(math.radians(azimuth)), azimuth)
         for azimuth in azimuths
     ]
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Where the cameras of a clip stand, the reference view last.
+
+    Attributes:
+        angles: (elevation, azimuth) of each frame in degrees. The elevation is absolute; the
+            azimuth counts from the reference view, counter-clockwise from above, in [0, 360).
+
+    Raises:
+        ValueError: fewer than two frames, a camera at or beyond a pole, numbers that are not
+            finite, or a last frame whose azimuth is not 0.
+    """
+
+    angles: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        turned = tuple((float(e), float(a) % 360.0 % 360.0) for e, a in self.angles)
+        object.__setattr__(self, "angles", turned)
+        if len(turned) < 2:
+            raise ValueError(f"wanted a path of at least 2 frames, got {len(turned)}")
+        for frame, (elevation, azimuth) in enumerate(turned):
+            if not (-90.0 < elevation < 90.0 and math.isfinite(azimuth)):
+                raise ValueError(
+                    "wanted elevations in (-90, 90) and finite azimuths in degrees, "
+                    f"got ({elevation}, {azimuth}) at frame {frame}"
+                )
+        if turned[-1][1] != 0.0:
+            raise ValueError(
+                f"wanted the reference view last, at azimuth 0, got azimuth {turned[-1][1]}; "
+                "append (elevation of the picture, 0) or count azimuths from the picture"
+            )
+
+    @classmethod
+    def orbit(cls, views: int, elevation_deg: float, swing_deg: float = 0.0) -> Self:
+        """Once around in even steps: static, or rising and sinking as the sine of the azimuth."""
+        return cls(tuple(orbit_angles(views, elevation_deg, swing_deg)))
+
+    def __len__(self) -> int:
+        return len(self.angles)
+
+    def tensors(self) -> tuple[Float[Tensor, "K"], Float[Tensor, "K"]]:
+        """Elevations and azimuths of all frames in degrees."""
+        elevation, azimuth = torch.tensor(self.angles).unbind(1)
+        return elevation, azimuth
 
 
 def orbit_cameras(

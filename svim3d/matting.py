@@ -1,4 +1,4 @@
-"""Cutting an object out of a picture: plain backgrounds, soft edges, colours without fringe.
+"""Cutting an object out of a picture with a plain background.
 
 A background is plain if one smooth gradient explains the border of the picture. The object is what
 cannot be reached from the border over pixels of that gradient, or over its own soft shadow.
@@ -13,7 +13,6 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from svim3d.color import linear_from_srgb
 
@@ -36,6 +35,8 @@ ADVICE = (
 )
 MIN_SIDE_PX = 16  # below this a border of pixels tells nothing of the background
 BORDER_SHARE = 0.02  # width of the frame that is looked at, of the picture's shorter side
+BORDER_DEGREE, FULL_DEGREE = 2, 4  # of the polynomials through the border and the background
+FIT_SAMPLES = 20_000  # pixels that stand for the whole background
 ROBUST_ITERATIONS = 20
 ROBUST_START, ROBUST_END = 0.2, 0.01  # Oklab; width of the weights at the first and last iteration
 MAD_TO_SIGMA = 1.4826  # of a normal distribution
@@ -50,7 +51,7 @@ SHADOW_DARKEST = 0.6  # cube root of the light that is left: a fifth; darker is 
 SHADOW_CHROMA = 0.02  # Oklab; a shadow keeps the background's hue, up to a tinted skylight
 SHADOW_SLOPE = 0.012  # Oklab per pixel; object edges are steeper
 SHADOW_GAP_PX = 2  # what is narrower is no way for a shadow into the object
-MIN_OBJECT_SHARE, MAX_OBJECT_SHARE = 0.0005, 0.95  # of the picture's pixels
+MIN_OBJECT_SHARE, MAX_OBJECT_SHARE = 0.0005, 0.9  # of the picture's pixels
 SIDE_SHARE = 0.1  # of a side's pixels; an object that takes more is cut off there
 SPECK_PX = 12  # fewer pixels than this are noise
 HOLE_SHARE = 0.004  # of the object; smaller enclosed patches of background are highlights
@@ -62,10 +63,6 @@ PATTERN_WEIGHT = 4.0  # of the colours' variance nearby, against the contrast ac
 CLEARLY_TOLD = 0.8  # weight of a mixture beyond which it says how soft the edges are
 ALL_OBJECT = 0.9  # a mixture of this share of object is taken for the object alone
 MIN_WEIGHT = 1e-4  # protects divisions by local weights
-FUSION_RADII_PX = (90, 6)  # Source: Forte 2021, "Approximate fast foreground colour estimation"
-GUIDE_SIDE_PX = 512  # the guided filter's coefficients are smooth: found on a small picture
-TAIL = 0.1  # faint mist that the filter leaves on both sides of an edge
-GUIDE_NOISE = 1e-4  # variance of the guide that is smoothed over; Source: He et al. 2013
 
 
 def cut_out_plain(rgb_srgb: Float[Tensor, "H W 3"], notify: Notify) -> Float[Tensor, "H W 1"]:
@@ -88,8 +85,8 @@ def cut_out_plain(rgb_srgb: Float[Tensor, "H W 3"], notify: Notify) -> Float[Ten
         )
     linear = linear_from_srgb(rgb_srgb)
     lab = oklab(linear).numpy()
-    gradient, tolerance = fit_backdrop(lab)
-    behind, backdrop = _flood(lab, gradient, tolerance)
+    backdrop, tolerance = fit_backdrop(lab)
+    behind, backdrop = _flood(lab, backdrop, tolerance)
     shadow = _soft_shadow(lab, backdrop, behind, tolerance)
     inside = _without_specks(~(behind | shadow))
     _refuse_extremes(inside)
@@ -105,9 +102,7 @@ def oklab(rgb_linear: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     return cones.clamp_min(0.0).pow(1.0 / 3.0) @ rgb_linear.new_tensor(OKLAB_OPPONENT).T
 
 
-def fit_backdrop(
-    lab: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], float]:
+def fit_backdrop(lab: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
     """The quadratic gradient [H, W, 3] through the picture's border, and the distance it scatters.
 
     Least squares with weights of Cauchy that narrow from iteration to iteration: what covers up to
@@ -121,15 +116,13 @@ def fit_backdrop(
     thick = max(1, round(BORDER_SHARE * min(height, width)))
     ring[thick:-thick, thick:-thick] = False
     seen = lab[ring].astype(np.float64)
-    basis = _quadratic_basis(height, width)
-    rows = basis[ring]
+    terms = _terms(ring, BORDER_DEGREE)
     residual = np.linalg.norm(seen - np.median(seen, 0), axis=1)
-    coefficients = np.zeros((rows.shape[1], 3))
+    coefficients = np.zeros((terms.shape[1], 3))
     for width_now in np.geomspace(ROBUST_START, ROBUST_END, ROBUST_ITERATIONS):
         weight = 1.0 / (1.0 + (residual / width_now) ** 2)
-        weighted = rows * weight[:, None]
-        coefficients = np.linalg.lstsq(weighted.T @ rows, weighted.T @ seen, rcond=None)[0]
-        residual = np.linalg.norm(seen - rows @ coefficients, axis=1)
+        coefficients = _least_squares(terms, seen, weight)
+        residual = np.linalg.norm(seen - terms @ coefficients, axis=1)
     plain = residual < MAX_TOLERANCE
     share = float(plain.mean())
     scatter = MAD_TO_SIGMA * float(np.median(residual[plain])) if plain.any() else 0.0
@@ -144,32 +137,65 @@ def fit_backdrop(
             f"it scatters by {scatter:.2f}, more than {MAX_SCATTER}, in Oklab; {ADVICE}"
         )
     tolerance = float(np.clip(NOISE_TOLERANCE * scatter, MIN_TOLERANCE, MAX_TOLERANCE))
-    return (basis @ coefficients).astype(np.float32), tolerance
+    return _surface(coefficients, BORDER_DEGREE, height, width), tolerance
 
 
-def _quadratic_basis(height: int, width: int) -> NDArray[np.float64]:
-    """1, x, y, x^2, xy, y^2 at every pixel, [H, W, 6]; x and y run from -1 to 1."""
-    y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
+def _powers(degree: int) -> list[tuple[int, int]]:
+    """Exponents of y and x of all terms of a polynomial."""
+    return [(i, total - i) for total in range(degree + 1) for i in range(total + 1)]
+
+
+def _terms(where: NDArray[np.bool_], degree: int) -> NDArray[np.float64]:
+    """All terms at the marked pixels, [P, T]; x and y run from -1 to 1 over the picture."""
+    rows, columns = np.nonzero(where)
+    y, x = np.linspace(-1, 1, where.shape[0])[rows], np.linspace(-1, 1, where.shape[1])[columns]
+    return np.stack([y**i * x**j for i, j in _powers(degree)], -1)
+
+
+def _surface(
+    coefficients: NDArray[np.float64], degree: int, height: int, width: int
+) -> NDArray[np.float32]:
+    """A polynomial at every pixel, [H, W, 3]."""
+    y, x = np.linspace(-1, 1, height), np.linspace(-1, 1, width)
+    total = np.zeros((height, width, 3), np.float32)
+    for (i, j), coefficient in zip(_powers(degree), coefficients, strict=True):
+        total += np.outer(y**i, x**j).astype(np.float32)[..., None] * coefficient.astype(np.float32)
+    return total
+
+
+def _least_squares(
+    terms: NDArray[np.float64], values: NDArray[np.float64], weight: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Coefficients [T, 3] that fit the values best."""
+    weighted = terms * weight[:, None]
+    found = np.linalg.lstsq(weighted.T @ terms, weighted.T @ values, rcond=None)[0]
+    return found.astype(np.float64)
 
 
 def _flood(
-    lab: NDArray[np.float32], gradient: NDArray[np.float32], tolerance: float
+    lab: NDArray[np.float32], backdrop: NDArray[np.float32], tolerance: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
     """Pixels like the background that are connected to the border, and the background itself.
 
-    Real backgrounds leave a quadratic: each round adds the local mean of what was left over.
+    The border tells a quadratic. Each round fits a quartic to all that was reached, as lenses and
+    lamps leave it, and adds the local mean of what is left over.
     """
+    height, width = lab.shape[:2]
     smooth = ndimage.uniform_filter(lab, (3, 3, 1))
-    radius = max(1, round(DRIFT_SHARE * max(lab.shape[:2])))
-    backdrop = gradient
-    behind = np.zeros(lab.shape[:2], bool)
+    radius = max(1, round(DRIFT_SHARE * max(height, width)))
+    behind = _from_border(np.linalg.norm(smooth - backdrop, axis=-1) < tolerance)
+    sample = np.zeros_like(behind)
+    step = max(1, round((height * width / FIT_SAMPLES) ** 0.5))
     for _ in range(DRIFT_ITERATIONS):
-        behind = _from_border(np.linalg.norm(smooth - backdrop, axis=-1) < tolerance)
+        sample[::step, ::step] = behind[::step, ::step]
+        seen = lab[sample].astype(np.float64)
+        found = _least_squares(_terms(sample, FULL_DEGREE), seen, np.ones(len(seen)))
+        gradient = _surface(found, FULL_DEGREE, height, width)
         weight = _local_mean(behind[..., None].astype(np.float32), radius)
         drift = _local_mean((lab - gradient) * behind[..., None], radius)
         # Where no background is near, the gradient is all that is known.
         backdrop = (gradient + drift / np.maximum(weight, LEAST_WEIGHT)).astype(np.float32)
+        behind = _from_border(np.linalg.norm(smooth - backdrop, axis=-1) < tolerance)
     return behind, backdrop
 
 
@@ -313,70 +339,3 @@ def _nearby_colour(
     square = ndimage.gaussian_filter((linear**2).sum(-1) * sure, reach) / weight[..., 0]
     variance = np.maximum(square - (mean**2).sum(-1), 0.0)
     return mean, variance, weight[..., 0] > 10.0 * MIN_WEIGHT
-
-
-def foreground_colour(
-    rgb_linear: Float[Tensor, "H W 3"], coverage: Float[Tensor, "H W 1"]
-) -> Float[Tensor, "H W 3"]:
-    """Straight linear colour of the object alone: the background's share is taken out.
-
-    Source: Forte 2021, "Approximate fast foreground colour estimation" (blur fusion, two rounds).
-    """
-    colour, mask = rgb_linear.numpy(), coverage.numpy()
-    front = back = colour
-    for radius in FUSION_RADII_PX:
-        front_mean = _weighted_mean(front, mask, radius)
-        back = _weighted_mean(back, np.float32(1.0) - mask, radius)
-        left_over = colour - mask * front_mean - (1.0 - mask) * back
-        front = np.clip(front_mean + mask * left_over, 0.0, 1.0)
-    return torch.from_numpy(front)
-
-
-def _weighted_mean(
-    values: NDArray[np.float32], weight: NDArray[np.float32], radius: int
-) -> NDArray[np.float32]:
-    """Box mean of `values` weighted by `weight`, which may vanish."""
-    size = (2 * radius + 1, 2 * radius + 1, 1)
-    total = ndimage.uniform_filter(values * weight, size, mode="nearest")
-    share = ndimage.uniform_filter(weight, size, mode="nearest")
-    return total / np.maximum(share, 1e-5)
-
-
-def sharpen_coverage(
-    rgb_srgb: Float[Tensor, "H W 3"], coverage: Float[Tensor, "H W 1"], *, radius_px: int
-) -> Float[Tensor, "H W 1"]:
-    """Move a blurred coverage onto the picture's own edges.
-
-    Args:
-        rgb_srgb: the guide.
-        coverage: blurred over about `radius_px` pixels.
-        radius_px: of the windows in which coverage is a linear function of colour.
-
-    Source: He, Sun, Tang 2013, "Guided image filtering", eq. 14 to 16, with the coefficients found
-    on a smaller picture as in He, Sun 2015, "Fast guided filter".
-    """
-    height, width = rgb_srgb.shape[:2]
-    factor = max(1.0, max(height, width) / GUIDE_SIDE_PX)
-    size = (max(1, round(height / factor)), max(1, round(width / factor)))
-    both = torch.cat([rgb_srgb, coverage], -1).permute(2, 0, 1)[None]
-    small = interpolate(both, size=size, mode="bilinear", antialias=True)[0].permute(1, 2, 0)
-    radius = max(1, round(radius_px / factor))
-    guide, target = small[..., :3].double(), small[..., 3:].double()
-    mean_guide, mean_target = _box(guide, radius), _box(target, radius)
-    products = (guide[..., :, None] * guide[..., None, :]).flatten(-2)
-    variance = _box(products, radius).unflatten(-1, (3, 3))
-    variance = variance - mean_guide[..., :, None] * mean_guide[..., None, :]
-    covariance = _box(guide * target, radius) - mean_guide * mean_target
-    regular = variance + GUIDE_NOISE * torch.eye(3, dtype=variance.dtype)
-    slope = torch.linalg.solve(regular, covariance[..., None])[..., 0]
-    offset = mean_target - (slope * mean_guide).sum(-1, keepdim=True)
-    smooth = _box(torch.cat([slope, offset], -1), radius).float().permute(2, 0, 1)[None]
-    full = interpolate(smooth, size=(height, width), mode="bilinear")[0].permute(1, 2, 0)
-    sharp = (full[..., :3] * rgb_srgb).sum(-1, keepdim=True) + full[..., 3:]
-    return ((sharp - TAIL) / (1.0 - 2.0 * TAIL)).clamp(0.0, 1.0)
-
-
-def _box(values: Float[Tensor, "H W C"], radius: int) -> Float[Tensor, "H W C"]:
-    """Mean over a square window, mirrored at the border."""
-    size = (2 * radius + 1, 2 * radius + 1, 1)
-    return torch.from_numpy(ndimage.uniform_filter(values.numpy(), size))

@@ -1,5 +1,6 @@
 """Adam over named parameters, whose whole state is a flat dictionary of tensors."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -99,3 +100,10 @@ class NamedAdam:
                     self._adam.state[parameter] = {
                         key: tensors[f"{key}.{name}"].clone().to(parameter.device) for key in keys
                     }
+
+
+def cosine(step: int, steps: int, warm_up: int, final: float) -> float:
+    """Share of the full rate at a step: a linear rise, then half a cosine down to `final`."""
+    rise = min(1.0, (step + 1) / max(warm_up, 1))
+    done = min(step / max(steps, 1), 1.0)
+    return rise * (final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * done)))

@@ -41,7 +41,8 @@ CONTRACT = (
 MAY_IMPORT = {
     "svim3d": BASICS,
     "svim3d.render": (*BASICS, *TIER_1),
-    "svim3d.io": (*BASICS, *TIER_1),
+    "svim3d.synthesis": (*BASICS, *TIER_1, "svim3d.render"),
+    "svim3d.io": (*BASICS, *TIER_1, "svim3d.synthesis.example"),
     "svim3d.charts": (*BASICS, *TIER_1),
     "stages": ("svim3d", *CONTRACT),
     "stages.settings": ("stages.settings",),
@@ -58,7 +59,7 @@ MAY_IMPORT = {
     "flows": ("flows", "stages"),
 }
 # Inside svim3d a unit of the middle tier sees itself and the basics.
-UNITS = {name: f"svim3d.{name}" for name in (*MIDDLE, "render", "io")}
+UNITS = {name: f"svim3d.{name}" for name in (*MIDDLE, "render", "synthesis", "io")}
 
 # One library, one door.
 DOORS = {
@@ -92,9 +93,13 @@ LIGHT = (
     "flows.commands",
     "flows.config",
     "flows.console",
+    "flows.data",
+    "flows.data_options",
     "flows.edit",
     "flows.engine",
     "flows.job",
+    "flows.model",
+    "flows.model_options",
     "flows.options",
     "flows.pipeline",
     "flows.plan",

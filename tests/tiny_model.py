@@ -1,4 +1,4 @@
-"""A generator of the real classes, tiny and untrained: 16 px pictures, 5 views."""
+"""The smallest model that has every part: 16 px pictures, five views, random weights."""
 
 from pathlib import Path
 
@@ -7,31 +7,32 @@ import torch
 from svim3d.diffusion.model import MaterialDiffusion, ModelSpec
 from svim3d.io.model_folder import write_model
 
-SPEC = ModelSpec(
+TINY = ModelSpec(
     name="tiny",
     image_size=16,
     views=5,
     fov_deg=33.8,
     latent_scale=1.0,
-    sigma_max=20.0,
-    steps=2,
-    guidance_max=2.0,
+    sigma_max=80.0,
+    steps=4,
+    guidance_max=1.5,
     unet={
-        "in_channels": 20,
-        "out_channels": 16,
+        "in_channels": 10,
+        "out_channels": 8,
         "block_out_channels": [32, 32],
         "num_attention_heads": [2, 2],
         "layers_per_block": 1,
         "cross_attention_dim": 16,
         "addition_time_embed_dim": 8,
-        "attention": [True, False],
+        "attention": [True, True],
     },
     autoencoder={
-        "block_out_channels": [32, 32],
-        "down_block_types": ["DownEncoderBlock2D"] * 2,
-        "up_block_types": ["UpDecoderBlock2D"] * 2,
-        "latent_channels": 4,
+        "block_out_channels": [8, 8, 8],
+        "down_block_types": ["DownEncoderBlock2D"] * 3,
+        "up_block_types": ["UpDecoderBlock2D"] * 3,
+        "latent_channels": 2,
         "layers_per_block": 1,
+        "norm_num_groups": 4,
         "sample_size": 16,
     },
     image_encoder={
@@ -48,15 +49,16 @@ SPEC = ModelSpec(
 
 
 def tiny_model(seed: int = 0) -> MaterialDiffusion:
-    """Random weights; the caller's random numbers stay as they were."""
-    with torch.random.fork_rng():
-        torch.random.manual_seed(seed)
-        model = MaterialDiffusion.untrained(SPEC)
-    for network in model.parts.values():
-        network.eval().requires_grad_(False)
+    """Random weights, a function of the seed."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = MaterialDiffusion.untrained(TINY)
+    for part in model.parts.values():
+        part.eval()
     return model
 
 
 def write_tiny_model(folder: Path, seed: int = 0) -> Path:
+    """The same as a folder; returns it."""
     write_model(folder, tiny_model(seed), "A model for tests.\n")
     return folder

@@ -62,6 +62,8 @@ def camera_numbers(
     and lies in [0, 2 pi). Source: SV3D's sampling script.
     """
     turned = (azimuth_deg - azimuth_deg[..., -1:]).remainder(360.0)
+    # The remainder of a tiny negative angle rounds to 360 itself.
+    turned = torch.where(turned < 360.0, turned, torch.zeros_like(turned))
     polar = torch.deg2rad(90.0 - elevation_deg)
     return torch.stack([torch.full_like(polar, added_noise), polar, torch.deg2rad(turned)], -1)
 
@@ -75,12 +77,40 @@ def embed_picture(
         encoder: a CLIP image tower of any size.
         picture: display-referred, in [-1, 1].
     """
-    side = encoder.config.image_size
-    resized = functional.interpolate(
-        picture.float(), size=(side, side), mode="bicubic", align_corners=False, antialias=True
-    )
+    resized = resize(picture.float(), encoder.config.image_size)
     mean = resized.new_tensor(CLIP_MEAN).view(1, 3, 1, 1)
     std = resized.new_tensor(CLIP_STD).view(1, 3, 1, 1)
     pixels = ((resized + 1.0) / 2.0 - mean) / std
     embedded: Tensor = encoder(pixel_values=pixels.to(encoder.dtype)).image_embeds
     return embedded[:, None]
+
+
+def resize(picture: Float[Tensor, "b c H W"], side: int) -> Float[Tensor, "b c side side"]:
+    """The resizing that SV3D was trained with: a Gaussian where it shrinks, then bicubic.
+
+    Corners stay corners. Source: kornia's `resize` with `antialias` and `align_corners`.
+    """
+    size = (side, side)
+    if picture.shape[-2:] == size:
+        return picture
+    for axis in (2, 3):
+        picture = _blur(picture, picture.shape[axis] / side, axis)
+    return functional.interpolate(picture, size=size, mode="bicubic", align_corners=True)
+
+
+def _blur(
+    picture: Float[Tensor, "b c H W"], shrinkage: float, axis: int
+) -> Float[Tensor, "b c H W"]:
+    """Along one axis, by half of what the scale exceeds 1; within 2 standard deviations."""
+    if shrinkage <= 1.0:
+        return picture
+    sigma = (shrinkage - 1.0) / 2.0
+    half = int(max(4.0 * sigma, 3.0)) // 2
+    offset = torch.arange(-half, half + 1, device=picture.device, dtype=picture.dtype)
+    taps = (-0.5 * (offset / sigma) ** 2).exp()
+    shape = [1, 1, 1, 1]
+    shape[axis] = len(taps)
+    kernel = (taps / taps.sum()).view(shape).expand(picture.shape[1], -1, -1, -1)
+    margins = (half, half, 0, 0) if axis == 3 else (0, 0, half, half)
+    padded = functional.pad(picture, margins, mode="reflect")
+    return functional.conv2d(padded, kernel, groups=picture.shape[1])

@@ -90,9 +90,9 @@ def without_background(
 
 
 def over_background(
-    rgb: Float[Tensor, "*b H W 3"],
-    mask: Float[Tensor, "*b H W 1"],
-    color: Float[Tensor, "*b 1 1 3"],
+    rgb: Float[Tensor, "*#b H W 3"],
+    mask: Float[Tensor, "*#b H W 1"],
+    color: Float[Tensor, "*#b 1 1 3"],
 ) -> Float[Tensor, "*b H W 3"]:
     """Another background behind display-referred pictures that stand on white."""
     return rgb - (1.0 - mask) * (1.0 - color)

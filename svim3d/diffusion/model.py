@@ -1,17 +1,16 @@
 """The generator as a whole: one picture and a list of cameras in, views with materials out."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
-from diffusers import AutoencoderKL
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from svim3d.diffusion.autoencoder import decode, encode
+from svim3d.diffusion.autoencoder import Autoencoder, build_autoencoder, decode, encode
 from svim3d.diffusion.conditioning import Conditioning, camera_numbers, embed_picture
 from svim3d.diffusion.groups import GROUPS, GeneratedViews, as_network_input, unpack
 from svim3d.diffusion.guidance import (
@@ -21,7 +20,8 @@ from svim3d.diffusion.guidance import (
     weights_by_index,
 )
 from svim3d.diffusion.karras import c_in, c_noise, denoised, noise_levels
-from svim3d.diffusion.sampler import sample, seeded_noise
+from svim3d.diffusion.prepared import PreparedUNet
+from svim3d.diffusion.sampler import Denoiser, sample, seeded_noise
 from svim3d.diffusion.unet import MaterialVideoUNet
 
 
@@ -45,7 +45,7 @@ class ModelSpec:
         cond_aug: noise that the network believes to be on the reference view.
         transfer: how RGB is encoded for display.
         unet: arguments of `MaterialVideoUNet`.
-        autoencoder: arguments of diffusers' `AutoencoderKL`.
+        autoencoder: arguments of diffusers' `AutoencoderKL` or of `PatchAutoencoder`.
         image_encoder: arguments of transformers' `CLIPVisionConfig`.
     """
 
@@ -70,8 +70,9 @@ class ModelSpec:
     @property
     def latent_side(self) -> int:
         """Side of a latent picture."""
-        halvings = len(self.autoencoder["block_out_channels"]) - 1
-        return int(self.image_size // 2**halvings)
+        if "patch" in self.autoencoder:
+            return int(self.image_size // self.autoencoder["patch"])
+        return int(self.image_size // 2 ** (len(self.autoencoder["block_out_channels"]) - 1))
 
     @property
     def latent_channels(self) -> int:
@@ -130,6 +131,7 @@ class Sampling:
         guidance_by: how guidance grows: with the frame's index, or with its azimuth.
         interval: noise levels at which guidance acts.
         decode_at_once: pictures that the autoencoder decodes together.
+        compiled: compile the network's blocks, see `PreparedUNet`.
     """
 
     steps: int | None = None
@@ -137,6 +139,7 @@ class Sampling:
     guidance_by: Literal["index", "azimuth"] = "index"
     interval: GuidanceInterval = field(default_factory=GuidanceInterval)
     decode_at_once: int = 21
+    compiled: bool = False
 
 
 class MaterialDiffusion:
@@ -153,7 +156,7 @@ class MaterialDiffusion:
         self,
         spec: ModelSpec,
         unet: MaterialVideoUNet,
-        autoencoder: AutoencoderKL,
+        autoencoder: Autoencoder,
         image_encoder: CLIPVisionModelWithProjection,
     ) -> None:
         self.spec = spec
@@ -167,9 +170,14 @@ class MaterialDiffusion:
         return cls(
             spec,
             MaterialVideoUNet(**spec.unet),
-            AutoencoderKL(**spec.autoencoder),
+            build_autoencoder(spec.autoencoder),
             CLIPVisionModelWithProjection(CLIPVisionConfig(**spec.image_encoder)),
         )
+
+    def with_latent_scale(self, scale: float) -> "MaterialDiffusion":
+        """The same networks with latents scaled differently."""
+        spec = replace(self.spec, latent_scale=scale)
+        return MaterialDiffusion(spec, self.unet, self.autoencoder, self.image_encoder)
 
     @property
     def parts(self) -> dict[str, torch.nn.Module]:
@@ -224,37 +232,60 @@ class MaterialDiffusion:
         spec, frames = self.spec, conditioning.camera.shape[1]
         side, channels = spec.latent_side, spec.latent_channels * len(spec.groups)
         noise = seeded_noise((1, frames, channels, side, side), seed, device=self.device)
-        sigmas = noise_levels(
-            sampling.steps or spec.steps,
+        return sample(
+            self.denoiser(conditioning, sampling), noise, self.noise_levels(sampling), report
+        )[0]
+
+    def noise_levels(self, sampling: Sampling) -> Float[Tensor, "steps_and_one"]:
+        """Descending noise levels of a draw, the last of them 0."""
+        spec = self.spec
+        return noise_levels(
+            spec.steps if sampling.steps is None else sampling.steps,
             sigma_min=spec.sigma_min,
             sigma_max=spec.sigma_max,
             rho=spec.rho,
         )
-        weights = self._guidance(conditioning, sampling)
-        both = conditioning.beside_unconditional()
 
-        def denoise(state: Tensor, sigma: float) -> Tensor:
-            guided = sampling.interval.holds(sigma) and bool((weights != 1.0).any())
-            if not guided:
-                return self.denoise(state, sigma, conditioning)
-            without, given = self.denoise(torch.cat([state, state]), sigma, both).chunk(2)
-            return guide(without, given, weights)
+    @torch.no_grad()
+    def denoiser(self, conditioning: Conditioning, sampling: Sampling) -> Denoiser:
+        """The guided network, prepared for many steps on one orbit.
 
-        return sample(denoise, noise, sigmas, report)[0]
+        Its plain twin: `denoise` without and with the reference view, and `guide` between them.
+        """
+        network = PreparedUNet(self.unet, compiled=sampling.compiled)
+        alone = network.bind(conditioning)
+        both = network.bind(conditioning.beside_unconditional())
+        weights = self.guidance(conditioning, sampling).to(self.device)
+        guides = bool((weights != 1.0).any())
+
+        def denoise(noisy: Tensor, sigma: float) -> Tensor:
+            level = torch.tensor([sigma], dtype=torch.float64)
+            told = c_noise(level).to(self.device, torch.float32)
+            scaled = noisy * float(c_in(level))
+            # Frames of weight 1 need the unconditional branch too: their neighbours see them in it.
+            if guides and sampling.interval.holds(sigma):
+                without, given = network(scaled, told, both).to(noisy.dtype).chunk(2)
+                answer = guide(without, given, weights)
+            else:
+                answer = network(scaled, told, alone).to(noisy.dtype)
+            return denoised(noisy, answer, level.to(noisy))
+
+        return denoise
 
     def denoise(
         self, noisy: Float[Tensor, "b k c h w"], sigma: float, conditioning: Conditioning
     ) -> Float[Tensor, "b k c h w"]:
         """The clean latents that the network expects behind noisy ones."""
-        level = torch.full((len(noisy),), sigma, dtype=noisy.dtype, device=noisy.device)
+        level = torch.full((len(noisy),), sigma, dtype=torch.float64)
         weights = self.unet.conv_in.weight.dtype
         answer = self.unet(
-            conditioning.beside(noisy * float(c_in(level[:1]))).to(weights),
-            c_noise(level).to(torch.float32),
+            # The reference view's latent is not scaled.
+            conditioning.beside(noisy * float(c_in(level[0]))).to(weights),
+            c_noise(level).to(noisy.device, torch.float32),
             conditioning.token.to(weights),
             conditioning.camera,
         )
-        return denoised(noisy, answer.to(noisy.dtype), level)
+        return denoised(noisy, answer.to(noisy.dtype), level.to(noisy))
 
     @torch.no_grad()
     def decode(
@@ -268,7 +299,8 @@ class MaterialDiffusion:
         pictures = decode(self.autoencoder, stacked, sampling.decode_at_once).chunk(len(groups))
         return unpack(dict(zip(self.spec.groups, pictures, strict=True)))
 
-    def _guidance(self, conditioning: Conditioning, sampling: Sampling) -> Float[Tensor, "K"]:
+    def guidance(self, conditioning: Conditioning, sampling: Sampling) -> Float[Tensor, "K"]:
+        """Strength of guidance at each frame."""
         strongest = sampling.guidance_max
         strongest = self.spec.guidance_max if strongest is None else strongest
         strength = {"weakest": self.spec.guidance_min, "strongest": strongest}

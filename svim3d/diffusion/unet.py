@@ -65,6 +65,8 @@ class MaterialVideoUNet(UNetSpatioTemporalConditionModel):  # type: ignore[misc]
         for name, module in self.named_modules():
             if isinstance(module, nn.GroupNorm) and not name.endswith(".norm"):
                 module.eps = GROUP_NORM_EPS
+        # diffusers makes the mixers' shares on the CPU whatever the default device is.
+        self.to(self.conv_in.weight.device)
 
     def embed(
         self, noise_level: Float[Tensor, "b"], camera: Float[Tensor, "b k 3"]
@@ -103,13 +105,8 @@ class MaterialVideoUNet(UNetSpatioTemporalConditionModel):  # type: ignore[misc]
         Raises:
             ValueError: sides that cannot be halved as often as the network does.
         """
-        batch, frames, _, *sides = sample.shape
-        halvings = 2**self.num_upsamplers
-        if any(side % halvings for side in sides):
-            raise ValueError(
-                f"wanted latents whose sides are multiples of {halvings}, got {tuple(sides)}; "
-                "choose an image size to match"
-            )
+        self.check_sides(sample)
+        batch, frames = sample.shape[:2]
         whole: dict[str, Any] = {
             "temb": self.embed(noise_level, camera),
             "image_only_indicator": sample.new_zeros(batch, frames),
@@ -132,6 +129,19 @@ class MaterialVideoUNet(UNetSpatioTemporalConditionModel):  # type: ignore[misc]
             )
         answer: Tensor = self.conv_out(self.conv_act(self.conv_norm_out(hidden)))
         return answer.unflatten(0, (batch, frames))
+
+    def check_sides(self, latents: Float[Tensor, "*b h w"]) -> None:
+        """Refuse latents whose sides cannot be halved as often as the network does.
+
+        Raises:
+            ValueError: such sides.
+        """
+        halvings, sides = 2**self.num_upsamplers, tuple(latents.shape[-2:])
+        if any(side % halvings for side in sides):
+            raise ValueError(
+                f"wanted latents whose sides are multiples of {halvings}, got {sides}; "
+                "choose an image size to match"
+            )
 
     def temporal_attention(self) -> list[nn.Parameter]:
         """Parameters of everything that lets frames attend to each other.

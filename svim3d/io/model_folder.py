@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from svim3d.diffusion.checkpoint import fill
 from svim3d.diffusion.model import MaterialDiffusion, ModelSpec
 from svim3d.io.weights import load_tensors, save_tensors
 
@@ -36,23 +37,31 @@ def bundled_model() -> Path:
 def write_model(
     folder: Path, model: MaterialDiffusion, card: str, dtype: torch.dtype = torch.float16
 ) -> None:
-    """Write all parts, the weights in `dtype`."""
+    """Write all parts, the weights in `dtype`; a model that was read from here stays whole."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, network in model.parts.items():
         tensors = {k: v.detach().to(dtype).contiguous() for k, v in network.state_dict().items()}
-        save_tensors(folder / f"{name}.safetensors", tensors)
-    description = {"format": FORMAT, **asdict(model.spec)}
+        # Read tensors are pages of their file, so that it is replaced and never written over.
+        temporary = folder / f"{name}.tmp"
+        save_tensors(temporary, tensors)
+        temporary.replace(folder / f"{name}.safetensors")
+    write_description(folder, model.spec, card)
+
+
+def write_description(folder: Path, spec: ModelSpec, card: str) -> None:
+    """Write all but the weights."""
+    description = {"format": FORMAT, **asdict(spec)}
     (folder / DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n")
     (folder / CARD).write_text(card)
 
 
-def read_spec(folder: Path) -> ModelSpec:
-    """What a model folder says of itself.
+def read_spec(folder: Path, name: str = DESCRIPTION) -> ModelSpec:
+    """What a model folder says of itself, or a description of that name alone.
 
     Raises:
         ValueError: no model folder, or one of another format.
     """
-    file = folder / DESCRIPTION
+    file = folder / name
     if not file.is_file():
         raise ValueError(
             f"wanted a model folder with {DESCRIPTION}, {folder} has none; "
@@ -86,7 +95,8 @@ def read_model(
         dtype: of the weights once read; sampling keeps its state in float32.
 
     Raises:
-        ValueError: missing, unexpected or misshapen tensors, named.
+        ValueError: a file that is missing or damaged; missing, unexpected or misshapen tensors,
+            named.
     """
     spec = read_spec(folder)
     with torch.device("meta"):
@@ -94,43 +104,8 @@ def read_model(
     for name, network in model.parts.items():
         tensors = load_tensors(folder / f"{name}.safetensors")
         fill(network, {k: v.to(device, dtype) for k, v in tensors.items()}, name)
-        _number_positions(network, device)
         network.eval().requires_grad_(False)
+    # The one buffer that no file holds: the indices of the image encoder's patches.
+    embeddings = model.image_encoder.vision_model.embeddings
+    embeddings.position_ids = torch.arange(embeddings.num_positions, device=device)[None]
     return model
-
-
-def _number_positions(network: torch.nn.Module, device: torch.device) -> None:
-    """Give CLIP's embedding the numbers of its positions, which are in no file and still on meta.
-
-    Any other such buffer would be noticed: the first use of a tensor on meta fails.
-    """
-    for module in network.modules():
-        positions = getattr(module, "position_ids", None)
-        if isinstance(positions, torch.Tensor) and positions.is_meta:
-            module.position_ids = torch.arange(positions.shape[-1], device=device)[None]
-
-
-def fill(network: torch.nn.Module, tensors: dict[str, torch.Tensor], what: str) -> None:
-    """Give a network on the meta device its weights.
-
-    Raises:
-        ValueError: names the first few missing, unexpected and misshapen tensors.
-    """
-    wanted = network.state_dict()
-    complaints = {
-        "missing": sorted(set(wanted) - set(tensors)),
-        "unexpected": sorted(set(tensors) - set(wanted)),
-        "of another shape": [
-            f"{name} {tuple(tensors[name].shape)} for {tuple(value.shape)}"
-            for name, value in wanted.items()
-            if name in tensors and tensors[name].shape != value.shape
-        ],
-    }
-    told = [
-        f"{len(names)} {kind} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
-        for kind, names in complaints.items()
-        if names
-    ]
-    if told:
-        raise ValueError(f"{what}: the tensors do not fit the network: {'; '.join(told)}")
-    network.load_state_dict(tensors, assign=True)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from svim3d.cameras import look_at_origin, orbit_angles, orbit_cameras
+from svim3d.cameras import CameraPath, look_at_origin, orbit_angles, orbit_cameras
 
 
 def an_orbit(size: int = 32):
@@ -64,3 +64,40 @@ def test_focal_length_matches_field_of_view():
 def test_pole_is_refused():
     with pytest.raises(ValueError, match="elevation"):
         look_at_origin(90.0, 0.0, 2.0)
+
+
+def test_static_path_keeps_its_elevation_and_ends_at_the_reference_view():
+    elevation, azimuth = CameraPath.orbit(21, 10.0).tensors()
+    assert elevation.tolist() == [10.0] * 21
+    expected = torch.tensor([360.0 * k / 21 for k in range(1, 21)] + [0.0])
+    assert torch.allclose(azimuth, expected)
+
+
+def test_swinging_path_rises_as_the_sine_of_its_azimuth():
+    elevation, azimuth = CameraPath.orbit(12, -5.0, 30.0).tensors()
+    assert torch.allclose(elevation, -5.0 + 30.0 * torch.sin(torch.deg2rad(azimuth)), atol=1e-4)
+    assert elevation[-1] == -5.0
+    assert float(elevation.max()) == pytest.approx(25.0, abs=1e-4)
+
+
+def test_any_list_of_angles_is_a_path():
+    path = CameraPath(((20.0, -90.0), (0.0, 725.0), (-1e-3, -1e-20), (7.0, 360.0)))
+    assert path.angles == ((20.0, 270.0), (0.0, 5.0), (-1e-3, 0.0), (7.0, 0.0))
+    assert len(path) == 4
+    assert len(orbit_cameras(list(path.angles), radius=2.0, fov_y_deg=33.8, size=8)) == 4
+
+
+@pytest.mark.parametrize(
+    ("angles", "wanted"),
+    [
+        ((), "at least 2 frames"),
+        (((0.0, 0.0),), "at least 2 frames"),
+        (((90.0, 10.0), (0.0, 0.0)), r"\(-90, 90\)"),
+        (((float("nan"), 10.0), (0.0, 0.0)), r"\(-90, 90\)"),
+        (((0.0, float("inf")), (0.0, 0.0)), "finite"),
+        (((0.0, 0.0), (10.0, 90.0)), "azimuth 0"),
+    ],
+)
+def test_impossible_paths_are_refused(angles, wanted):
+    with pytest.raises(ValueError, match=wanted):
+        CameraPath(angles)

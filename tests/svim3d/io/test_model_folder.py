@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from tiny_model import SPEC, tiny_model, write_tiny_model
+from tiny_model import TINY, tiny_model, write_tiny_model
 
 from svim3d.io import model_folder
 from svim3d.io.model_folder import bundled_model, read_model, read_spec
@@ -40,7 +40,7 @@ def test_nothing_stays_on_the_meta_device(tmp_path):
 
 def test_a_spec_comes_back_and_mistakes_in_it_are_named(tmp_path):
     write_tiny_model(tmp_path)
-    assert read_spec(tmp_path) == SPEC
+    assert read_spec(tmp_path) == TINY
     file = tmp_path / "model.json"
     said = json.loads(file.read_text())
     for change, complaint in (

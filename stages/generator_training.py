@@ -1,0 +1,247 @@
+"""Trains the generator on stored clips, in two phases.
+
+Phase 1 leaves temporal attention alone and takes all examples, those of poor materials for RGB and
+normals only; phase 2 frees everything and takes the others. What a step sees is a function of seed
+and step, so that a run which went on from a checkpoint ends like one that never stopped.
+
+Source: Engelhardt et al. 2025, SViM3D, section 4.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from stages.base import Context
+from stages.errors import InputError
+from stages.settings.training import GeneratorTrainingConfig
+from svim3d.diffusion.clips import StoredClip
+from svim3d.diffusion.conditioning import Conditioning, camera_numbers, embed_picture
+from svim3d.diffusion.model import MaterialDiffusion
+from svim3d.diffusion.training import (
+    Clips,
+    Draws,
+    MovingAverage,
+    separate_frames,
+    velocity_errors,
+    weighted_loss,
+)
+from svim3d.io.clip_file import read_clip
+from svim3d.optim import NamedAdam, Rate, cosine
+
+ADAM_EPS = 1e-8
+AVERAGE = "average."  # prefix of moving averages in a checkpoint
+GROUP_TERMS = ("rgb", "basecolor", "orm", "normal")
+
+
+@dataclass
+class _Fit:
+    """All that a step changes."""
+
+    model: MaterialDiffusion
+    named: dict[str, nn.Parameter]
+    adam: NamedAdam
+    average: MovingAverage
+
+    @classmethod
+    def start(cls, model: MaterialDiffusion, config: GeneratorTrainingConfig) -> "_Fit":
+        parts = {"unet": model.unet}
+        if config.trains_image_encoder:
+            parts["image_encoder"] = model.image_encoder
+        named = {f"{p}.{n}": v for p, net in parts.items() for n, v in net.named_parameters()}
+        adam = NamedAdam(named, {name: Rate(config.rate_1, ADAM_EPS) for name in named})
+        return cls(model, named, adam, MovingAverage(named.items(), config.decay))
+
+    def state(self) -> dict[str, Tensor]:
+        averages = {f"{AVERAGE}{name}": value for name, value in self.average.values.items()}
+        return self.adam.state() | averages
+
+    def load_state(self, tensors: dict[str, Tensor]) -> None:
+        self.adam.load_state(tensors)
+        for name, value in self.average.values.items():
+            value.copy_(tensors[f"{AVERAGE}{name}"])
+
+    def adopt_averages(self) -> None:
+        """The moving averages become the model's weights."""
+        self._put(self.average.values)
+
+    @contextlib.contextmanager
+    def averaged(self) -> Iterator[None]:
+        """Within this context the model's weights are the moving averages."""
+        kept = {name: p.detach().clone() for name, p in self.named.items()}
+        self.adopt_averages()
+        try:
+            yield
+        finally:
+            self._put(kept)
+
+    @torch.no_grad()
+    def _put(self, values: dict[str, Tensor]) -> None:
+        for name, parameter in self.named.items():
+            parameter.copy_(values[name])
+
+
+def train_generator(
+    model: MaterialDiffusion,
+    clip_files: Sequence[Path],
+    config: GeneratorTrainingConfig,
+    ctx: Context,
+    *,
+    on_checkpoint: Callable[[int], None],
+    on_sheet: Callable[[int], None],
+    stop_after_s: float | None = None,
+) -> int:
+    """Train in place; ends with the moving averages as the model's weights.
+
+    Args:
+        model: whose UNet is trained.
+        clip_files: as `precompute_latents` leaves them.
+        config: settings.
+        ctx: gives checkpoints and random numbers.
+        on_checkpoint: called with the steps done whenever a checkpoint was written, while the model
+            holds the moving averages.
+        on_sheet: the same, less often.
+        stop_after_s: stop at the first step after this many seconds; the next call goes on.
+
+    Returns:
+        Steps done, in this and earlier calls.
+    """
+    clips = [read_clip(file) for file in clip_files]
+    good = [clip for clip in clips if clip.has_good_materials]
+    if not clips or (config.phase_2_steps and not good):
+        raise InputError(
+            f"wanted clips to train on, got {len(clips)}, {len(good)} of them with good materials"
+        )
+    if config.gradient_checkpointing:
+        model.unet.enable_gradient_checkpointing()
+    for part in model.parts.values():
+        part.requires_grad_(False)
+    fit = _Fit.start(model, config)
+    saved = ctx.checkpoints.load()
+    first = 0
+    if saved is not None:
+        first, tensors = saved
+        fit.load_state(tensors)
+    elif config.from_scratch:
+        separate_frames(model.unet)
+        fit.average = MovingAverage(fit.named.items(), config.decay)
+    total = config.phase_1_steps + config.phase_2_steps
+    started_s = sheet_s = time.monotonic()
+    done = first
+    for step in range(first, total):
+        phase = 1 if step < config.phase_1_steps else 2
+        _set_free(model, phase, config)
+        batch = draw_clips(clips if phase == 1 else good, model, step, config, ctx)
+        _step(fit, batch, step, phase, config, ctx)
+        done = step + 1
+        is_last = done == total or _is_over(started_s, stop_after_s)
+        if is_last or ctx.checkpoints.due():
+            ctx.checkpoints.save(done, fit.state())
+            with fit.averaged():
+                on_checkpoint(done)
+                if is_last or time.monotonic() - sheet_s > config.sheet_every_s:
+                    sheet_s = time.monotonic()
+                    on_sheet(done)
+        if is_last:
+            break
+    fit.adopt_averages()
+    return done
+
+
+def _is_over(started_s: float, stop_after_s: float | None) -> bool:
+    return stop_after_s is not None and time.monotonic() - started_s > stop_after_s
+
+
+def _set_free(model: MaterialDiffusion, phase: int, config: GeneratorTrainingConfig) -> None:
+    """What learns in a phase."""
+    model.unet.requires_grad_(True)
+    if phase == 1:
+        for parameter in model.unet.temporal_attention():
+            parameter.requires_grad_(False)
+    model.image_encoder.requires_grad_(config.trains_image_encoder and phase == 1)
+
+
+def draw_clips(
+    clips: Sequence[StoredClip],
+    model: MaterialDiffusion,
+    step: int,
+    config: GeneratorTrainingConfig,
+    ctx: Context,
+) -> Clips:
+    """The batch of a step: objects, lights and reference views, a function of the seed alone."""
+    generator = ctx.generator(f"clips {step}")
+
+    def below(count: int) -> int:
+        return int(torch.randint(count, (1,), generator=generator))
+
+    latents, references, pictures, cameras, good = [], [], [], [], []
+    for _ in range(config.batch):
+        clip = clips[below(len(clips))]
+        light = below(len(clip.rgb))
+        form = int(clip.form[light])
+        views = clip.azimuth_deg.shape[1]
+        turns = config.any_reference and clip.is_even(form)
+        order = clip.frames_seen_from(below(views) if turns else views - 1)
+        groups = torch.cat([clip.rgb[light][None], clip.materials[form]])[:, order].float()
+        latents.append(groups.transpose(0, 1).flatten(1, 2) * model.spec.latent_scale)
+        references.append(groups[0, -1])
+        pictures.append(clip.pictures[light, order[-1]])
+        elevation, azimuth = clip.elevation_deg[form][order], clip.azimuth_deg[form][order]
+        cameras.append(camera_numbers(elevation, azimuth, model.spec.cond_aug))
+        good.append(clip.has_good_materials)
+    shown = torch.stack(pictures).to(ctx.device).float() / 127.5 - 1.0
+    with _autocast(config, ctx):
+        token = embed_picture(model.image_encoder, shown).float()
+    return Clips(
+        latents=torch.stack(latents).to(ctx.device),
+        conditioning=Conditioning(
+            token=token,
+            latent=torch.stack(references).to(ctx.device),
+            camera=torch.stack(cameras).to(ctx.device),
+        ),
+        has_good_materials=torch.tensor(good, device=ctx.device),
+    )
+
+
+def _step(
+    fit: _Fit, clips: Clips, step: int, phase: int, config: GeneratorTrainingConfig, ctx: Context
+) -> None:
+    """One optimiser step; a non-finite one is skipped and counted."""
+    draws = Draws.of(
+        clips.latents.shape,
+        ctx.generator(f"noise {step}"),
+        mean=config.noise_mean,
+        spread=config.noise_spread,
+        drop_share=config.drop_share,
+    ).to(ctx.device)
+    with _autocast(config, ctx):
+        errors = velocity_errors(fit.model.unet, clips, draws)
+    loss = weighted_loss(errors, clips.has_good_materials)
+    terms = {"loss": float(loss.detach())}
+    terms |= dict(zip(GROUP_TERMS, errors.detach().mean(0).tolist(), strict=True))
+    if ctx.is_finite(step, {"loss": loss}):
+        fit.adam.zero_grad()
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(fit.named.values(), config.clip)
+        terms["gradient"] = float(norm)
+        if ctx.is_finite(step, {"gradient": norm}):
+            fit.adam.step(_rate(step, phase, config))
+            fit.average.update(fit.named, step)
+    ctx.report(step + 1, config.phase_1_steps + config.phase_2_steps, terms)
+
+
+def _rate(step: int, phase: int, config: GeneratorTrainingConfig) -> float:
+    """Share of `rate_1` at which a step is taken."""
+    if phase == 1:
+        return min(1.0, (step + 1) / config.warm_up)
+    into = step - config.phase_1_steps
+    share = cosine(into, config.phase_2_steps, config.warm_up, config.final_rate)
+    return share * config.rate_2 / config.rate_1
+
+
+def _autocast(config: GeneratorTrainingConfig, ctx: Context) -> torch.autocast:
+    return torch.autocast(ctx.device.type, torch.bfloat16, enabled=config.precision == "bfloat16")

@@ -1,0 +1,158 @@
+"""A training run's folder: what it is made of, and how it goes on.
+
+settings.json      settings, model and data that the run was begun with
+autoencoder/       checkpoint and losses; sheet.png
+latents/           a clip file per example
+generator/         checkpoint and losses; sheet-<steps>.png
+model/             a complete model folder, of the last checkpoint
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from stages.base import Context, Progress
+from stages.errors import InputError
+from stages.settings.training import TrainingConfig
+from svim3d.diffusion.model import MaterialDiffusion, ModelSpec
+from svim3d.io.model_folder import DESCRIPTION, read_model, read_spec, write_model
+
+SETTINGS, MODEL = "settings.json", "model"
+EXAMPLES = "*.safetensors"
+# Settings that may change when a run goes on: they say how long, not how.
+FREE = {("generator", "phase_1_steps"), ("generator", "phase_2_steps"), ("autoencoder", "steps")}
+
+
+class TrainingFolder:
+    """Where a training run keeps everything.
+
+    Args:
+        root: the folder.
+        seed: of all random numbers.
+        device: where to train.
+        on_progress: told of every step.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        seed: int,
+        device: torch.device,
+        on_progress: Callable[[Progress], None] | None = None,
+    ) -> None:
+        self.root = root
+        self.seed = seed
+        self.device = device
+        self._on_progress = on_progress
+
+    @property
+    def model_folder(self) -> Path:
+        """The model as of the last checkpoint."""
+        return self.root / MODEL
+
+    def context(self, part: str, checkpoint_every_s: float) -> Context:
+        """Surroundings of one part of the training."""
+        return Context(
+            stage=f"training {part}",
+            device=self.device,
+            seed=self.seed,
+            work=self.root / part,
+            shared=self.root / "shared",
+            on_progress=self._on_progress,
+            checkpoint_every_s=checkpoint_every_s,
+        )
+
+    def require_same(self, config: TrainingConfig, spec: ModelSpec, data: Path) -> None:
+        """Hold a run to what it was begun with; write that down at the beginning.
+
+        Raises:
+            InputError: something else than the number of steps has changed.
+        """
+        file = self.root / SETTINGS
+        now = json.loads(
+            json.dumps({"config": config.model_dump(), "model": asdict(spec), "seed": self.seed})
+        )
+        begun = json.loads(file.read_text()) if file.exists() else now
+        begun.pop("data", None)
+        if changed := sorted(_changes(begun, now)):
+            raise InputError(
+                f"{self.root} was begun with other settings ({', '.join(changed[:5])}); "
+                "use the old ones, or train in another folder"
+            )
+        self.root.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(now | {"data": data.name}, indent=1) + "\n")
+
+    @property
+    def has_autoencoder(self) -> bool:
+        """Whether the autoencoder is done: a model is written once it is."""
+        return (self.model_folder / DESCRIPTION).exists()
+
+    def start_model(self, spec: ModelSpec, source: Path) -> MaterialDiffusion:
+        """The last checkpoint's weights; or the source's, if it has any; or random ones."""
+        if self.has_autoencoder:
+            return self.reread_model()
+        if source.is_dir():
+            self.keep_model(read_model(source, self.device))
+            return self.reread_model()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed)
+            model = MaterialDiffusion.untrained(spec)
+        for part in model.parts.values():
+            part.to(self.device)
+        return model
+
+    def reread_model(self) -> MaterialDiffusion:
+        """As it is kept, rounded: a run that went on sees the same as one that never stopped."""
+        return read_model(self.model_folder, self.device)
+
+    def keep_model(self, model: MaterialDiffusion, steps: int = 0) -> None:
+        """Write the model folder anew, one file after the other."""
+        card = (
+            f"# {model.spec.name}\n\nA checkpoint of a training run after {steps} steps of the "
+            "generator. Nobody has judged it yet.\n"
+        )
+        write_model(self.model_folder, model, card)
+
+
+def examples_of(data: Path) -> list[Path]:
+    """Files of rendered examples, in order.
+
+    Raises:
+        InputError: there are none.
+    """
+    found = sorted(data.glob(EXAMPLES)) if data.is_dir() else []
+    if not found:
+        raise InputError(
+            f"wanted a folder of rendered examples, {data} holds none; "
+            "make some with svim3d data render"
+        )
+    return found
+
+
+def load_model_spec(file: Path) -> ModelSpec:
+    """What to train: a model folder, or a `model.json` alone.
+
+    Raises:
+        InputError: it is neither.
+    """
+    try:
+        return read_spec(file if file.is_dir() else file.parent, file.name)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+
+
+def _changes(old: Mapping[str, Any], new: Mapping[str, Any], path: Sequence[str] = ()) -> list[str]:
+    """Dotted names that differ and may not."""
+    changed = []
+    for name in {*old, *new}:
+        here = (*path, name)
+        one, two = old.get(name), new.get(name)
+        if isinstance(one, Mapping) and isinstance(two, Mapping):
+            changed += _changes(one, two, here)
+        elif one != two and here[1:] not in FREE:
+            changed.append(".".join(here))
+    return changed

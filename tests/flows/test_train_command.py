@@ -1,0 +1,119 @@
+"""`svim3d train` from examples to a model folder, in pieces, and what it refuses."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_model import TINY
+
+from flows.cli import main
+from svim3d.io.model_folder import FORMAT, read_model
+from svim3d.io.training_data import write_example
+from svim3d.synthesis.example import TrainingExample
+
+SPEC = replace(TINY, autoencoder={"patch": 4, "latent_channels": 2, "hidden": 8, "layers": 1})
+SETTINGS = (
+    "autoencoder.steps=4",
+    "autoencoder.batch=4",
+    "generator.phase_1_steps=2",
+    "generator.phase_2_steps=2",
+    "generator.warm_up=1",
+    "generator.precision=float32",
+    "generator.from_scratch=true",
+)
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    folder = tmp_path / "data"
+    folder.mkdir()
+    for index in range(2):
+        draw = torch.Generator().manual_seed(index)
+
+        def picture(*lead: int, draw: torch.Generator = draw) -> torch.Tensor:
+            shape = (*lead, SPEC.views, SPEC.image_size, SPEC.image_size, 3)
+            return torch.randint(256, shape, generator=draw, dtype=torch.uint8)
+
+        example = TrainingExample(
+            rgb=picture(2),
+            basecolor=picture(),
+            orm=picture(),
+            normal=picture(),
+            mask=picture()[..., :1],
+            elevation_deg=torch.full((SPEC.views,), 10.0),
+            azimuth_deg=(torch.arange(1, SPEC.views + 1) * (360.0 / SPEC.views)) % 360.0,
+            metadata={"quality": "good"},
+        )
+        write_example(folder / f"{index:06d}.safetensors", example)
+    return folder
+
+
+@pytest.fixture
+def spec(tmp_path: Path) -> Path:
+    file = tmp_path / "tiny.json"
+    file.write_text(json.dumps({"format": FORMAT, **asdict(SPEC)}))
+    return file
+
+
+def command(data: Path, out: Path, model: Path, *more: str) -> list[str]:
+    settings = [part for setting in SETTINGS for part in ("--set", setting)]
+    given = ["train", str(data), "-o", str(out), "--model", str(model), "--device", "cpu"]
+    return [*given, *settings, *more]
+
+
+def test_it_leaves_a_model_losses_and_sheets(data, spec, tmp_path):
+    out = tmp_path / "run"
+    assert main(command(data, out, spec)) == 0
+    model = read_model(out / "model", torch.device("cpu"))
+    assert model.spec.name == "tiny"
+    assert model.spec.latent_scale != SPEC.latent_scale
+    assert (out / "generator" / "sheet-0000004.png").stat().st_size > 0
+    assert (out / "autoencoder" / "sheet.png").stat().st_size > 0
+    rows = (out / "generator" / "scalars.csv").read_text().splitlines()
+    assert {row.split(",")[0] for row in rows} == {"1", "2", "3", "4"}
+    assert {row.split(",")[1] for row in rows} >= {"loss", "rgb", "orm", "gradient"}
+
+
+def test_pieces_leave_the_same_model(data, spec, tmp_path):
+    whole, pieces = tmp_path / "whole", tmp_path / "pieces"
+    assert main(command(data, whole, spec)) == 0
+    for _ in range(5):
+        assert main(command(data, pieces, spec, "--minutes", "0")) == 0
+    for name in ("unet", "autoencoder", "image_encoder"):
+        file = f"model/{name}.safetensors"
+        assert (whole / file).read_bytes() == (pieces / file).read_bytes(), name
+
+
+def test_a_run_holds_to_its_settings_but_may_be_longer(data, spec, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main(command(data, out, spec)) == 0
+    assert main(command(data, out, spec, "--set", "generator.phase_2_steps=3")) == 0
+    assert main(command(data, out, spec, "--set", "generator.batch=3")) == 2
+    assert "begun with other settings (config.generator.batch)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("--set", "generator.speed=1"), "no such setting"),
+        (("--config", "nowhere.yaml"), "cannot be read"),
+        (("--model", "nowhere"), "wanted a model folder"),
+    ],
+)
+def test_wrong_options_are_told_in_a_line(data, spec, tmp_path, capsys, change, message):
+    assert main(command(data, tmp_path / "run", spec, *change)) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_without_examples_it_says_how_to_make_some(spec, tmp_path, capsys):
+    assert main(command(tmp_path / "none", tmp_path / "run", spec)) == 2
+    assert "svim3d data render" in capsys.readouterr().err
+
+
+def test_a_foreign_autoencoder_needs_a_model_folder(data, tmp_path, capsys):
+    file = tmp_path / "kl.json"
+    file.write_text(json.dumps({"format": FORMAT, **asdict(TINY)}))
+    assert main(command(data, tmp_path / "run", file)) == 2
+    assert "--model FOLDER" in capsys.readouterr().err

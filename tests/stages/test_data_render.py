@@ -1,0 +1,103 @@
+"""Folders of training data: resumed, refused, with files that cannot be read."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from stages.data_render import (
+    SUMMARY,
+    DataRequest,
+    environment_files,
+    mesh_files,
+    render_data,
+)
+from stages.errors import InputError
+from svim3d.io.exr import write_rgb
+from svim3d.io.training_data import read_example
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def request_of(tmp_path, cache):
+    return DataRequest(
+        folder=tmp_path / "data",
+        seed=5,
+        size=16,
+        views=3,
+        lights=2,
+        meshes=(),
+        environments=(),
+        cache=cache,
+    )
+
+
+def statuses(request, objects):
+    return [outcome.status for outcome in render_data(request, objects, workers=1)]
+
+
+def test_a_stopped_run_goes_on_where_it_was(request_of):
+    assert statuses(request_of, 3) == ["made"] * 3
+    files = sorted(request_of.folder.glob("*.safetensors"))
+    content = [file.read_bytes() for file in files]
+    times = [file.stat().st_mtime_ns for file in files]
+    files[1].write_bytes(content[1][: len(content[1]) // 2])  # as a killed copy leaves it
+    (request_of.folder / "000002.123.tmp").write_bytes(b"half")
+    assert statuses(request_of, 4) == ["kept", "made", "kept", "made"]
+    assert [file.read_bytes() for file in files] == content
+    assert [files[i].stat().st_mtime_ns for i in (0, 2)] == [times[0], times[2]]
+
+
+def test_the_summary_tells_what_is_there(request_of):
+    statuses(request_of, 2)
+    told = json.loads((request_of.folder / SUMMARY).read_text())
+    assert told["objects"] == 2 and sum(told["quality"].values()) == 2
+    assert (told["seed"], told["size"], told["views"], told["lights"]) == (5, 16, 3, 2)
+    assert read_example(request_of.folder / "000001.safetensors").rgb.shape == (2, 3, 16, 16, 3)
+
+
+def test_other_settings_are_refused(request_of):
+    statuses(request_of, 1)
+    with pytest.raises(InputError, match="holds data of other settings"):
+        statuses(replace(request_of, seed=6), 1)
+
+
+def test_meshes_and_environments_come_from_folders(request_of, tmp_path):
+    meshes, lights = tmp_path / "meshes", tmp_path / "lights"
+    meshes.mkdir()
+    lights.mkdir()
+    (meshes / "a_broken.glb").write_bytes(b"not a mesh")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+    (meshes / "b_good.obj").write_text(corners + "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    write_rgb(lights / "sky.exr", torch.ones(16, 32, 3).numpy())
+    request = replace(request_of, meshes=mesh_files(meshes), environments=environment_files(lights))
+    outcomes = list(render_data(request, 4, workers=1))
+    assert [o.status for o in outcomes] == ["skipped", "made", "skipped", "made"]
+    assert "a_broken.glb was left out" in outcomes[0].message
+    example = read_example(request.folder / "000001.safetensors")
+    assert example.metadata["name"] == "b_good" and example.metadata["quality"] == "low"
+    assert "sky turned" in example.metadata["environments"]
+    assert json.loads((request.folder / SUMMARY).read_text())["skipped"] == 2
+
+
+def test_empty_and_missing_folders_are_refused(tmp_path):
+    assert mesh_files(None) == ()
+    with pytest.raises(InputError, match="there is no folder"):
+        mesh_files(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="wanted environments"):
+        environment_files(tmp_path)
+
+
+@pytest.mark.slow
+def test_several_processes_write_the_same_bytes(request_of, tmp_path):
+    assert statuses(request_of, 3) == ["made"] * 3
+    other = replace(request_of, folder=tmp_path / "other")
+    assert [o.status for o in render_data(other, 3, workers=2)] == ["made"] * 3
+    for file in request_of.folder.glob("*.safetensors"):
+        assert file.read_bytes() == (other.folder / file.name).read_bytes()
