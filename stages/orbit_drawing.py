@@ -88,6 +88,7 @@ def draw_samples(
         guidance_max=config.guidance_max,
         guidance_by=config.guidance_by,
         interval=GuidanceInterval(*(config.guidance_interval or ())),
+        compiled=config.compiled,
     )
     samples = []
     for number in range(config.samples):

@@ -53,6 +53,9 @@ class PhotoSettings(FileReadingConfig):
     dtype: Literal["auto", "float32", "bfloat16"] = "auto"
     """Of the weights; `auto` takes bfloat16 on a GPU, float32 elsewhere."""
 
+    compiled: bool = False
+    """Compile the network: worth its minutes for large models on a GPU."""
+
     keep_photo: bool = True
     """Let the photo itself be the colour of the view that it shows. Source: SV3D."""
 
