@@ -13,7 +13,7 @@ from pathlib import Path
 
 from flows.data_options import data_options
 from flows.model_options import model_options
-from flows.options import edit_options, job_options, relight_options
+from flows.options import edit_options, job_options, photo_settings, relight_options
 from flows.train_options import train_options
 
 DONE, FAILED, BAD_INPUT, CANCELLED = 0, 1, 2, 130
@@ -84,7 +84,7 @@ def _dispatch(options: argparse.Namespace) -> int:
         source=options.input,
         out=options.output,
         preset=options.preset,
-        overrides=tuple(options.set),
+        overrides=(*photo_settings(options), *options.set),
         skip=frozenset(options.skip),
         start=options.start,
         until=options.until,
@@ -99,7 +99,7 @@ def _dispatch(options: argparse.Namespace) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="svim3d", description="Views of an object in, a relightable 3D asset out."
+        prog="svim3d", description="A photo or views of an object in, a relightable 3D asset out."
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     shared = argparse.ArgumentParser(add_help=False)

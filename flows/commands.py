@@ -15,14 +15,16 @@ from flows.plan import Plan, Selection, make_plan
 from stages.store import Store
 
 EXAMPLE = "example"
+# Words that stand for files that come with the program.
+SHIPPED = {EXAMPLE: "example.json", "photo": "example_photo.png"}
 OUTPUT_ROOT = Path("out")
 
 
 def input_path(given: str) -> Path:
-    """Where an input lies; the word `example` stands for the scene that comes with the program."""
-    if given != EXAMPLE:
+    """Where an input lies; `example` and `photo` stand for files that come with the program."""
+    if given not in SHIPPED:
         return Path(given)
-    return Path(str(importlib.resources.files("configs") / "example.json"))
+    return Path(str(importlib.resources.files("configs") / SHIPPED[given]))
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from stages.settings.env_preopt import EnvPreoptConfig
 from stages.settings.export import ExportConfig
 from stages.settings.generation import GenerationConfig
 from stages.settings.nerf import NerfConfig
+from stages.settings.prepare import PrepareConfig
 from stages.settings.preview import PreviewConfig
 from stages.settings.relight import RelightConfig
 from stages.settings.uv_bake import UvBakeConfig
@@ -35,9 +36,11 @@ class RunConfig(BaseModel):
 
 
 class PipelineConfig(RunConfig):
-    """Settings of all stages from views to asset."""
+    """Settings of all stages from photo to asset."""
 
-    generation: GenerationConfig = GenerationConfig()
+    prepare: PrepareConfig = PrepareConfig()
+    # Made when it is needed: it digests the files of a model.
+    generation: GenerationConfig = Field(default_factory=GenerationConfig)
     env_preopt: EnvPreoptConfig = EnvPreoptConfig()
     nerf: NerfConfig = NerfConfig()
     dmtet: DmtetConfig = DmtetConfig()

@@ -1,6 +1,7 @@
 """The options of each command."""
 
 import argparse
+import json
 from pathlib import Path
 
 from flows.pipeline import IMAGE_TO_ASSET
@@ -16,8 +17,8 @@ def job_options() -> argparse.ArgumentParser:
         nargs="?",
         default="example",
         metavar="INPUT",
-        help="an orbit folder, a .glb, .gltf or .obj file, a scene file (.json), or the word "
-        "'example' (the default)",
+        help="a photo (.png, .jpg, .webp, .tif, ...), an orbit folder, a .glb, .gltf or .obj file, "
+        "a scene file (.json), or one of the words 'photo' and 'example' (the default)",
     )
     job.add_argument(
         "-o", "--output", type=Path, metavar="OUT", help="run folder (out/<name of the input>)"
@@ -32,6 +33,7 @@ def job_options() -> argparse.ArgumentParser:
         metavar="STAGE.NAME=VALUE",
         help="change one setting; may be repeated",
     )
+    _add_photo(job)
     for option, target, purpose in (
         ("--from", "start", "recompute this stage and all after it"),
         ("--until", "until", "stop after this stage"),
@@ -54,6 +56,40 @@ def job_options() -> argparse.ArgumentParser:
     )
     _add_machine(job)
     return job
+
+
+def _add_photo(job: argparse.ArgumentParser) -> None:
+    """Short forms of settings that most photos are run with."""
+    photo = job.add_argument_group("photos")
+    photo.add_argument(
+        "--samples",
+        type=int,
+        metavar="K",
+        help="draw K orbits, keep the most agreed-on one and trust each pixel accordingly (1)",
+    )
+    photo.add_argument(
+        "--model", type=Path, metavar="DIR", help="folder of the generator (the bundled one)"
+    )
+    photo.add_argument(
+        "--matting",
+        metavar="HOW",
+        help="what cuts the object out: auto, alpha, plain, network, or a network's .onnx file "
+        "(auto)",
+    )
+
+
+def photo_settings(options: argparse.Namespace) -> tuple[str, ...]:
+    """What those options mean, as `--set` would say it."""
+    given = {"generation.samples": options.samples, "generation.model": options.model}
+    if options.matting is not None:
+        is_file = options.matting.lower().endswith(".onnx")
+        given["prepare.network" if is_file else "prepare.matting"] = options.matting
+    # Quoted as JSON, which YAML reads too: paths may hold any character.
+    return tuple(
+        f"{name}={json.dumps(value if isinstance(value, int) else str(value))}"
+        for name, value in given.items()
+        if value is not None
+    )
 
 
 def relight_options() -> argparse.ArgumentParser:

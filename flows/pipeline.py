@@ -5,12 +5,17 @@ The plan, the flow and the command line all read this page. Nothing here imports
 
 import importlib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from stages.errors import InputError
 
 if TYPE_CHECKING:
     from stages.base import Stage
 
-SOURCE = "source"  # the input from outside: an orbit folder, a mesh or a scene file
+SOURCE = "source"  # the input from outside: a photo, an orbit folder, a mesh or a scene file
+PHOTOS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".gif")
+MESHES = (".glb", ".gltf", ".obj", ".json")  # scenes among them
 
 
 @dataclass(frozen=True)
@@ -21,12 +26,14 @@ class Node:
         name: of the stage, its module, its settings and, in upper case, its `Stage`.
         inputs: names of upstream stages or `SOURCE`, in the order of the stage's signature.
         is_skippable: whether later stages can do without it.
+        only_for: suffixes of the input files that the stage has work for; empty means any input.
         package: where the module lies.
     """
 
     name: str
     inputs: tuple[str, ...]
     is_skippable: bool = False
+    only_for: tuple[str, ...] = ()
     package: str = "stages"
 
     @property
@@ -34,10 +41,18 @@ class Node:
         """Full name of the stage's module."""
         return f"{self.package}.{self.name}"
 
+    def has_work_for(self, source: Path) -> bool:
+        """Whether the stage does anything for this input."""
+        return not self.only_for or (_suffix(source) in self.only_for and not source.is_dir())
+
     def load(self) -> "Stage":
         """Import the stage, and with it whatever it computes with."""
         stage: Stage = getattr(importlib.import_module(self.module), self.name.upper())
         return stage
+
+
+def _suffix(source: Path) -> str:
+    return source.suffix.lower()
 
 
 @dataclass(frozen=True)
@@ -55,11 +70,19 @@ class Product:
 
 @dataclass(frozen=True)
 class Pipeline:
-    """Stages in an order in which every input comes before its user, and the products."""
+    """Stages in an order in which every input comes before its user, and the products.
+
+    Attributes:
+        name: of the flow.
+        nodes: the stages.
+        products: what the run folder is for.
+        takes: suffixes of the input files that can be used; empty leaves it to the stages.
+    """
 
     name: str
     nodes: tuple[Node, ...]
     products: tuple[Product, ...]
+    takes: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -71,11 +94,24 @@ class Pipeline:
         """Names of the stages that may be left out."""
         return tuple(node.name for node in self.nodes if node.is_skippable)
 
+    def check(self, source: Path) -> None:
+        """Refuse a file of a kind that no stage can use.
+
+        Raises:
+            InputError: naming the kinds that can be.
+        """
+        if self.takes and source.is_file() and _suffix(source) not in self.takes:
+            raise InputError(
+                f"wanted a photo, a mesh or a scene ({', '.join(self.takes)}) or an orbit folder, "
+                f"got {source.name}; convert it, or correct its ending"
+            )
+
 
 IMAGE_TO_ASSET = Pipeline(
     name="image-to-asset",
     nodes=(
-        Node("generation", (SOURCE,)),
+        Node("prepare", (SOURCE,), only_for=PHOTOS),
+        Node("generation", (SOURCE, "prepare")),
         Node("env_preopt", ("generation",), is_skippable=True),
         Node("nerf", ("generation", "env_preopt")),
         Node("dmtet", ("generation", "nerf"), is_skippable=True),
@@ -89,7 +125,9 @@ IMAGE_TO_ASSET = Pipeline(
             "environment.exr", (("export", "environment.exr"), ("env_preopt", "environment.exr"))
         ),
         Product("preview.png", (("preview", "preview.png"),)),
+        Product("views.png", (("generation", "views.png"),)),
     ),
+    takes=(*PHOTOS, *MESHES),
 )
 
 RELIGHT = Pipeline(

@@ -74,6 +74,20 @@ class Selection:
                 if names.index(name) > last:
                     raise InputError(f"{option} {name} comes after --until {self.until}")
 
+    def check_idle(self, idle: set[str], source: Path) -> None:
+        """Refuse wishes for a stage that does nothing for this input.
+
+        Raises:
+            InputError: naming the option.
+        """
+        named = {"--from": self.start, "--until": self.until, "--only": self.only}
+        wishes = [*named.items(), *(("--force", name) for name in sorted(self.force))]
+        for option, name in wishes:
+            if name in idle:
+                raise InputError(
+                    f"{option} {name}: the stage has nothing to do for {source.name}; drop it"
+                )
+
     def wants(self, pipeline: Pipeline, name: str) -> bool:
         """Whether the run needs the stage's artifact."""
         if self.only:
@@ -158,16 +172,22 @@ def make_plan(
     """Look up every stage in the store and say why those that are missing are.
 
     Raises:
-        InputError: the input is not there, the wishes contradict each other, or `--only` lacks
-            an artifact that it starts from.
+        InputError: the input is not there or of no use, the wishes contradict each other, or
+            `--only` lacks an artifact that it starts from.
     """
+    pipeline.check(source)
     selection = replace(selection, skip=selection.skip | config.skip)
     selection.check(pipeline)
-    recipes = _recipes(pipeline, config, source, seed, selection.skip)
+    idle = {node.name for node in pipeline.nodes if not node.has_work_for(source)}
+    selection.check_idle(idle, source)
+    recipes = _recipes(pipeline, config, source, seed, selection.skip | idle)
     explain = _Explainer(store)
     steps = []
     for node in pipeline.nodes:
         recipe = recipes.get(node.name)
+        if node.name in idle:
+            steps.append(Step(node, Verdict.SKIPPED, "nothing to do for this input", None, None))
+            continue
         steps.append(_step(node, recipe, pipeline, selection, store, explain))
     _require_inputs_of_only(steps, selection)
     return Plan(pipeline, tuple(steps), source, config, seed, selection)

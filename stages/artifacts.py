@@ -18,6 +18,7 @@ from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
 from svim3d.io.exr import read_rgb, write_rgb
 from svim3d.io.image import read_png, write_png
 from svim3d.io.orbit import read_orbit, write_orbit
+from svim3d.io.orbit_sheet import orbit_sheet
 from svim3d.io.weights import load_tensors, save_tensors
 from svim3d.mesh.marching import extract_surface
 from svim3d.numerics import normalize
@@ -38,6 +39,7 @@ class MaterialViews:
         normal_world: unit shading normals, straight.
         reference: index of the view at azimuth 0 that the asset was asked for by.
         depth: distance along the camera's -z axis, zero where nothing is; None where nobody knows.
+        confidence: how far each pixel is to be trusted, in [0, 1]; None means all of them wholly.
     """
 
     cameras: Cameras
@@ -49,9 +51,12 @@ class MaterialViews:
     normal_world: Float[Tensor, "V H W 3"]
     reference: int
     depth: Float[Tensor, "V H W 1"] | None = None
+    confidence: Float[Tensor, "V H W 1"] | None = None
 
     def premultiplied(self, longest_px: int) -> tuple[Cameras, dict[str, Tensor]]:
         """What an optimisation compares renders with: images times coverage, cameras to match.
+
+        Where there is `confidence`, it comes with them as it is: a weight for each pixel's losses.
 
         Args:
             longest_px: larger views are averaged down to at most this size; the whole picture stays
@@ -64,6 +69,7 @@ class MaterialViews:
             "roughness": self.roughness * self.mask,
             "metallic": self.metallic * self.mask,
             "normal_world": normalize(self.normal_world) * self.mask,
+            **({} if self.confidence is None else {"confidence": self.confidence}),
         }
         factor = -(-max(self.cameras.height, self.cameras.width) // longest_px)
         height, width = self.cameras.height // factor, self.cameras.width // factor
@@ -72,21 +78,10 @@ class MaterialViews:
         return self.cameras.resized(height, width), planes
 
     def save(self, folder: Path) -> None:
-        """Write an orbit folder (the exchange format, see README)."""
-        write_orbit(
-            folder,
-            self.cameras,
-            {
-                "radiance": self.radiance,
-                "mask": self.mask,
-                "basecolor": self.basecolor,
-                "roughness": self.roughness,
-                "metallic": self.metallic,
-                "normal_world": self.normal_world,
-                **({} if self.depth is None else {"depth": self.depth}),
-            },
-            reference=self.reference,
-        )
+        """Write an orbit folder (the exchange format, see README) and a sheet to look at."""
+        known = {name: v for name, v in vars(self).items() if isinstance(v, Tensor)}
+        write_orbit(folder, self.cameras, known, reference=self.reference)
+        write_png(folder / "views.png", orbit_sheet(self.cameras, known))
 
     @classmethod
     def load(cls, folder: Path) -> Self:

@@ -140,23 +140,24 @@ def _image_losses(
     """Weighted differences between one rendered view and its target, both premultiplied."""
     straight = rendered.normal_world / rendered.mask.detach().clamp_min(MIN_COVERAGE)
     both = torch.minimum(rendered.mask.detach(), target["mask"])
+    trust = target.get("confidence")
+    guide = ray_losses.smoothing_guide(target["radiance"], trust)
     return {
-        "mask": config.mask_weight * (rendered.mask - target["mask"]).square().mean(),
+        "mask": config.mask_weight * ray_losses.squared_loss(rendered.mask, target["mask"], trust),
         "basecolor": config.basecolor_weight
-        * ray_losses.color_loss(rendered.basecolor, target["basecolor"]),
+        * ray_losses.color_loss(rendered.basecolor, target["basecolor"], trust),
         "orm": config.orm_weight
         * ray_losses.absolute_loss(
             torch.cat([rendered.roughness, rendered.metallic], -1),
             torch.cat([target["roughness"], target["metallic"]], -1),
+            trust,
         ),
         "normal": config.normal_weight
-        * ray_losses.absolute_loss(rendered.normal_world, target["normal_world"]),
+        * ray_losses.absolute_loss(rendered.normal_world, target["normal_world"], trust),
         "radiance": config.radiance_weight
-        * ray_losses.radiance_loss(rendered.radiance, target["radiance"]),
+        * ray_losses.radiance_loss(rendered.radiance, target["radiance"], trust),
         "normal_smoothness": config.normal_smoothness_weight
-        * ray_losses.bilateral_loss(
-            _blocks(straight), _blocks(ray_losses.tonemap(target["radiance"])), _blocks(both)
-        ),
+        * ray_losses.bilateral_loss(_blocks(straight), _blocks(guide), _blocks(both)),
     }
 
 

@@ -40,6 +40,7 @@ def run(views: MaterialViews, *, config: EnvPreoptConfig, ctx: Context) -> Envir
     """
     pixels = _usable_pixels(views, config, ctx)
     radiance = pixels.pop("radiance").to(ctx.device)
+    trust = pixels.pop("confidence").to(ctx.device) if "confidence" in pixels else None
     operator = cached_operator(ctx.shared, config.size, config.prefilter)
     shading = StoredShading.build(
         **{name: value.to(ctx.device) for name, value in pixels.items()},
@@ -50,7 +51,7 @@ def run(views: MaterialViews, *, config: EnvPreoptConfig, ctx: Context) -> Envir
     white = torch.ones(config.size, config.size, 3, device=ctx.device)
     start = radiance.sum(0) / shading(operator(white)).sum(0).clamp_min(MIN_RADIANCE)
     log_radiance = (white * start.clamp_min(MIN_RADIANCE)).log().requires_grad_()
-    objective = _Objective(radiance)
+    objective = _Objective(radiance, trust)
     optimizer = torch.optim.Adam([log_radiance], lr=config.learning_rate, betas=ADAM_BETAS)
     for step in range(_resume(ctx, log_radiance, optimizer), config.steps):
         if ctx.checkpoints.due():
@@ -72,9 +73,13 @@ def run(views: MaterialViews, *, config: EnvPreoptConfig, ctx: Context) -> Envir
 
 
 class _Objective:
-    """Mean absolute difference of square roots, relative to the pictures' own brightness."""
+    """Mean absolute difference of square roots, relative to the pictures' own brightness.
 
-    def __init__(self, radiance: Float[Tensor, "P 3"]) -> None:
+    With a confidence each pixel's difference counts by it.
+    """
+
+    def __init__(self, radiance: Float[Tensor, "P 3"], trust: Float[Tensor, "P 1"] | None) -> None:
+        self._trust = trust
         self._floor = BLACK_LEVEL * radiance.mean().clamp_min(MIN_RADIANCE)
         self._target = (radiance + self._floor).sqrt()
         self._clipped = _clipped(radiance)
@@ -83,7 +88,8 @@ class _Objective:
         residual = (shaded + self._floor).sqrt() - self._target
         # A clipped highlight says only that the light is at least so bright.
         residual = torch.where(self._clipped, residual.clamp_max(0.0), residual)
-        return residual.abs().mean() / self._target.mean()
+        difference = residual.abs() if self._trust is None else residual.abs() * self._trust
+        return difference.mean() / self._target.mean()
 
 
 def _clipped(radiance: Float[Tensor, "P 3"]) -> Bool[Tensor, "P 3"]:
@@ -107,6 +113,8 @@ def _usable_pixels(
         normal = normalize(views.normal_world[view].reshape(-1, 3))
         facing = dot(normal, -rays)[:, 0] > config.min_n_dot_v
         covered = views.mask[view].reshape(-1) > config.min_mask
+        if views.confidence is not None:
+            covered &= views.confidence[view].reshape(-1) > 0.0
         finite = torch.isfinite(views.radiance[view].reshape(-1, 3)).all(-1)
         pixels = torch.nonzero(facing & covered & finite)[:, 0]
         directions.append(-rays[pixels])
@@ -129,6 +137,7 @@ def _usable_pixels(
         "metallic": views.metallic,
         "radiance": views.radiance,
         "normal": views.normal_world,
+        **({} if views.confidence is None else {"confidence": views.confidence}),
     }
     pixels_of = {name: t.reshape(-1, t.shape[-1])[index] for name, t in planes.items()}
     return pixels_of | {"normal": normalize(pixels_of["normal"]), "wo": wo}

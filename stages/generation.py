@@ -1,8 +1,9 @@
 """Generation: whatever shows the object -> views with materials.
 
-Reads an orbit folder (path-traced, photographed or generated elsewhere), or a mesh file (.glb,
-.gltf, .obj) or a scene file (.json) that our own renderer turns into an orbit under an environment.
-Rendered radiance is a split-sum approximation without visibility: no shadows, no interreflection.
+Reads a photo, of whose prepared object the diffusion model draws an orbit; or an orbit folder
+(path-traced, photographed or generated elsewhere); or a mesh file (.glb, .gltf, .obj) or a scene
+file (.json) that our own renderer turns into an orbit under an environment. Rendered radiance is a
+split-sum approximation without visibility: no shadows, no interreflection.
 """
 
 from pathlib import Path
@@ -14,6 +15,7 @@ from torch import Tensor
 from stages.artifacts import MaterialViews
 from stages.base import Context, Stage
 from stages.errors import InputError
+from stages.photo_artifact import PreparedPhoto
 from stages.prefilter_cache import cached_operator
 from stages.settings.generation import GenerationConfig
 from svim3d.cameras import fitting_radius, orbit_angles, orbit_cameras
@@ -28,18 +30,29 @@ from svim3d.shading.octahedral import texel_directions
 from svim3d.shading.studio import studio_radiance
 
 
-def run(source: Path, *, config: GenerationConfig, ctx: Context) -> MaterialViews:
-    """Views of the object in `source`.
+def run(
+    source: Path,
+    prepared: PreparedPhoto | None = None,
+    *,
+    config: GenerationConfig,
+    ctx: Context,
+) -> MaterialViews:
+    """Views of the object in `source`, or of the object that was cut out of it.
 
     Raises:
         InputError: the source cannot be used; says what was wanted, what came, what to do.
     """
     if not source.exists():
         raise InputError(
-            f"wanted an orbit folder, a mesh or a scene, but {source} does not exist; "
+            f"wanted a photo, an orbit folder, a mesh or a scene, but {source} does not exist; "
             "check the path"
         )
     try:
+        if prepared is not None:
+            # The diffusion libraries take seconds to import, and only photos need them.
+            from stages.orbit_drawing import views_of_photo
+
+            return views_of_photo(prepared, config=config, ctx=ctx)
         if source.is_dir():
             return _from_orbit(source, ctx)
         return _from_mesh(normalised(read_object(source), source.name), config, ctx)

@@ -32,6 +32,8 @@ NUMERIC_LIBRARIES = (
     "xatlas",
     "pymeshlab",
     "fast-simplification",
+    "diffusers",
+    "transformers",
 )
 # Optional, but what they do belongs to the key all the same.
 OPTIONAL_LIBRARIES = (
@@ -94,7 +96,7 @@ def digest_input(path: Path) -> str:
     """
     if not path.exists():
         raise InputError(
-            f"input {path} does not exist; give an orbit folder, a mesh or a scene file"
+            f"input {path} does not exist; give a photo, an orbit folder, a mesh or a scene file"
         )
     try:
         if path.is_dir():

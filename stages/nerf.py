@@ -130,6 +130,12 @@ def _check(views: MaterialViews) -> None:
         )
 
 
+def _silhouettes(planes: dict[str, Tensor]) -> Tensor:
+    """Masks that carve the hull only where they are to be trusted."""
+    mask = planes["mask"]
+    return torch.maximum(mask, 1.0 - planes["confidence"]) if "confidence" in planes else mask
+
+
 def _hull(masks: Tensor, cameras: Cameras, config: NerfConfig, ctx: Context) -> Tensor:
     """Signed distance of the visual hull, positive inside.
 
@@ -227,16 +233,19 @@ def _losses(
     depth = blocks(rendered.depth) / blocks(rendered.mask).clamp_min(MIN_COVERAGE)
     both = torch.minimum(blocks(rendered.mask).detach(), target["mask"])
     normal_weight = config.normal_weight + done * (config.normal_weight_end - config.normal_weight)
+    trust = target.get("confidence")
     terms = {
-        "mask": config.mask_weight * ray_losses.mask_loss(blocks(rendered.mask), target["mask"]),
+        "mask": config.mask_weight
+        * ray_losses.mask_loss(blocks(rendered.mask), target["mask"], trust),
         "basecolor": config.basecolor_weight
-        * ray_losses.color_loss(blocks(rendered.basecolor), target["basecolor"]),
+        * ray_losses.color_loss(blocks(rendered.basecolor), target["basecolor"], trust),
         "orm": config.orm_weight
         * ray_losses.squared_loss(
             torch.cat([blocks(rendered.roughness), blocks(rendered.metallic)], -1),
             torch.cat([target["roughness"], target["metallic"]], -1),
+            trust,
         ),
-        "normal": normal_weight * ray_losses.absolute_loss(normal, target["normal_world"]),
+        "normal": normal_weight * ray_losses.absolute_loss(normal, target["normal_world"], trust),
         "normal_smoothness": config.normal_smoothness_weight
         * ray_losses.bilateral_loss(straight, target["guide"], both),
         "depth_smoothness": config.depth_smoothness_weight
@@ -248,7 +257,7 @@ def _losses(
         )
     if rendered.radiance is not None:
         terms["radiance"] = config.radiance_weight * ray_losses.radiance_loss(
-            blocks(rendered.radiance), target["radiance"]
+            blocks(rendered.radiance), target["radiance"], trust
         )
         light = fit.log_environment.exp()
         terms["light_balance"] = (
@@ -256,7 +265,7 @@ def _losses(
         )
     if done >= config.bump_start:
         terms["bump_normal"] = config.bump_normal_weight * ray_losses.absolute_loss(
-            blocks(rendered.normal_shading), target["normal_world"]
+            blocks(rendered.normal_shading), target["normal_world"], trust
         )
         terms["bump_size"] = config.bump_size_weight * ray_losses.size_loss(rendered.bump)
     return terms
@@ -347,8 +356,8 @@ def run(
     cameras, planes = views.premultiplied(config.image_size)
     cameras = cameras.to(ctx.device)
     planes = {name: plane.to(ctx.device) for name, plane in planes.items()}
-    hull = _hull(planes["mask"], cameras, config, ctx)
-    planes["guide"] = ray_losses.tonemap(planes["radiance"])
+    hull = _hull(_silhouettes(planes), cameras, config, ctx)
+    planes["guide"] = ray_losses.smoothing_guide(planes["radiance"], planes.get("confidence"))
     blocks = _pixel_blocks(cameras, planes, hull, config)
     fit = _start(hull, environment, config, ctx)
     _optimise(fit, blocks, config, ctx)

@@ -164,16 +164,20 @@ def _sharpened(
 ) -> Float[Tensor, "P 5"]:
     """Texels whose rendered pixels agree with the views; those that no view sees stay as baked.
 
-    Pixels at the rim of the mask are left out, slanted ones count by the cosine squared.
+    Pixels at the rim of the mask are left out, slanted ones count by the cosine squared, all of
+    them by their confidence.
     """
     assert mesh.uv is not None
     seen = texel_view(mesh.vertices, mesh.faces, mesh.uv, views.cameras, texture_size=texels.size)
     images = torch.cat([views.basecolor, views.roughness, views.metallic, views.mask], -1)
     target, mask = images.reshape(-1, 6)[seen.pixel].split([5, 1], 1)
+    weight = (mask >= SOLID) * seen.trust.clamp_min(0.0) ** 2
+    if views.confidence is not None:
+        weight = weight * views.confidence.reshape(-1, 1)[seen.pixel]
     fitted = fit_texels(
         seen.operator,
         target,
-        (mask >= SOLID) * seen.trust.clamp_min(0.0) ** 2,
+        weight,
         to_image(baked, texels).view(-1, 5),
         prior=config.fit_prior,
         iterations=config.fit_iterations,

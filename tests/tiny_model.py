@@ -1,8 +1,11 @@
 """The smallest model that has every part: 16 px pictures, five views, random weights."""
 
+from pathlib import Path
+
 import torch
 
 from svim3d.diffusion.model import MaterialDiffusion, ModelSpec
+from svim3d.io.model_folder import write_model
 
 TINY = ModelSpec(
     name="tiny",
@@ -53,3 +56,9 @@ def tiny_model(seed: int = 0) -> MaterialDiffusion:
     for part in model.parts.values():
         part.eval()
     return model
+
+
+def write_tiny_model(folder: Path, seed: int = 0) -> Path:
+    """The same as a folder; returns it."""
+    write_model(folder, tiny_model(seed), "A model for tests.\n")
+    return folder

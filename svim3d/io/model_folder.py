@@ -3,6 +3,7 @@
 The folder is complete in itself: nothing is fetched, nothing is pickled.
 """
 
+import importlib.resources
 import json
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -15,6 +16,22 @@ from svim3d.io.weights import load_tensors, save_tensors
 
 FORMAT = "svim3d-model/1"
 DESCRIPTION, CARD = "model.json", "README.md"
+BUNDLED = "models/svim3d-small"  # inside the package
+
+
+def bundled_model() -> Path:
+    """The folder of the model that comes with the program.
+
+    Raises:
+        ValueError: this copy of the program has none.
+    """
+    folder = Path(str(importlib.resources.files("svim3d") / BUNDLED))
+    if not (folder / DESCRIPTION).is_file():
+        raise ValueError(
+            f"wanted the bundled model in {folder}, this copy of the program came without it; "
+            "install it anew, or name a model folder with --model"
+        )
+    return folder
 
 
 def write_model(

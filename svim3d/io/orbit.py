@@ -2,9 +2,10 @@
 
 `orbit.json` holds `camera` {width, height, fov_deg (vertical)}, the frames and the reference;
 each frame names a multi-channel half-float EXR. Radiance (`R G B`) is premultiplied by the
-coverage `A`; basecolor, roughness, metallic and the world normal are straight. Depth may be there
-or not. Two layouts are read: `frames` with `reference` as an index (what `write_orbit` makes), and
-the layout of benchmark sets: `train`, and `test` whose frames name one file per environment.
+coverage `A`; basecolor, roughness, metallic and the world normal are straight. Depth and a
+confidence may be there or not. Two layouts are read: `frames` with `reference` as an index (what
+`write_orbit` makes), and the layout of benchmark sets: `train`, and `test` whose frames name one
+file per environment.
 """
 
 import contextlib
@@ -31,7 +32,9 @@ CHANNELS = {
     "metallic": ("metallic.V",),
     "normal_world": ("normal.X", "normal.Y", "normal.Z"),
 }
-DEPTH = ("depth.Z",)  # along the camera's -z axis; image `depth`, where all views have it
+# Images that are there where all views have them: depth along the camera's -z axis, and how far the
+# view is to be trusted, from 0 to 1.
+OPTIONAL_CHANNELS = {"depth": ("depth.Z",), "confidence": ("confidence.V",)}
 INDEX = "orbit.json"
 RIGID_TOLERANCE = 1e-3  # poses written with 4 decimals pass, mirrored or scaled ones do not
 
@@ -46,11 +49,12 @@ def write_orbit(
     Args:
         folder: where to.
         cameras: V poses.
-        images: the named images of `CHANNELS`, each [V, H, W, C], and `depth` where it is known.
+        images: the named images of `CHANNELS`, each [V, H, W, C], and those of
+            `OPTIONAL_CHANNELS` that are known.
         reference: index of the view that the asset was asked for by.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    named = CHANNELS | ({"depth": DEPTH} if "depth" in images else {})
+    named = CHANNELS | {n: c for n, c in OPTIONAL_CHANNELS.items() if n in images}
     frames = []
     for view in range(len(cameras)):
         name = f"{view:03d}.exr"
@@ -94,7 +98,8 @@ def read_orbit(
     Args:
         folder: an orbit folder of either layout.
         split: `train`, or `test_A` for the test views under environment A.
-        wanted: which images of `CHANNELS` are needed; `depth` comes with them if all views have it.
+        wanted: which images of `CHANNELS` are needed; those of `OPTIONAL_CHANNELS` come with them
+            if all views have them.
         notify: told (kind, message) of every value that had to be mended; see `repair_images`.
 
     Raises:
@@ -243,16 +248,16 @@ def _is_rigid(pose: Float[Tensor, "4 4"]) -> bool:
 
 
 def _read_views(files: list[Path], cameras: Cameras, wanted: Collection[str]) -> Images:
-    """The wanted images of all views, and depth if each of them has it."""
+    """The wanted images of all views, and those optional ones that each of them has."""
     views = [_read_view(file, cameras.height, cameras.width, wanted) for file in files]
-    names = [*wanted, *(["depth"] if all("depth" in view for view in views) else [])]
+    names = [*wanted, *(n for n in OPTIONAL_CHANNELS if all(n in view for view in views))]
     return {name: torch.stack([view[name] for view in views]) for name in names}
 
 
 def _read_view(
     file: Path, height: int, width: int, wanted: Collection[str]
 ) -> dict[str, Float[Tensor, "_ _ _"]]:
-    """The wanted images of one view, and depth if it is there."""
+    """The wanted images of one view, and the optional ones that are there."""
     planes = read_exr(file)
     named = {name: CHANNELS[name] for name in wanted}
     needed = [channel for channels in named.values() for channel in channels]
@@ -262,8 +267,7 @@ def _read_view(
             f"wanted the channels {', '.join(needed)} in {file}, missing {', '.join(missing)}; "
             "export them, or render the orbit from a mesh"
         )
-    if DEPTH[0] in planes:
-        named["depth"] = DEPTH
+    named |= {name: c for name, c in OPTIONAL_CHANNELS.items() if c[0] in planes}
     shapes = {planes[channel].shape for channels in named.values() for channel in channels}
     if shapes != {(height, width)}:
         raise ValueError(

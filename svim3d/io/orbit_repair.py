@@ -156,26 +156,27 @@ def admit_views(
             f"wanted at least {MIN_VIEWS} views with an object before a background, got "
             f"{len(kept)} of {len(cameras)}; check the masks (channel A) or add views"
         )
-    _check_fit(cameras[kept], images["mask"][kept])
+    past = share_outside(cameras[kept], images["mask"][kept])
+    if past > MAX_SHARE_OUTSIDE:
+        raise ValueError(
+            "wanted the object inside the cube [-0.5, 0.5]^3, but "
+            f"{past:.0%} of the covered pixels look past it; scale and centre the "
+            "poses so that the object's longest side is 1, or check the masks"
+        )
     backward = cameras.c2w[:, :3, 2]
     likeness = backward[kept] @ backward[reference]
     return cameras[kept], {n: i[kept] for n, i in images.items()}, int(likeness.argmax())
 
 
-def _check_fit(cameras: Cameras, mask: Float[Tensor, "V H W 1"]) -> None:
-    """Refuse masks that reach beyond the object's cube as the cameras see it."""
+def share_outside(cameras: Cameras, mask: Float[Tensor, "V H W 1"]) -> float:
+    """Share of the covered pixels that look past the object's cube."""
     covered = outside = 0
     for view in range(len(cameras)):
         pixels = torch.nonzero(mask[view].reshape(-1) > 0.5)[:, 0]
         origin, direction = (rays[pixels] for rays in cameras.rays(view))
         covered += len(pixels)
         outside += int((~_hits_cube(origin, direction)).sum())
-    if outside > MAX_SHARE_OUTSIDE * covered:
-        raise ValueError(
-            "wanted the object inside the cube [-0.5, 0.5]^3, but "
-            f"{outside / covered:.0%} of the covered pixels look past it; scale and centre the "
-            "poses so that the object's longest side is 1, or check the masks"
-        )
+    return outside / covered if covered else 0.0
 
 
 def _hits_cube(origin: Float[Tensor, "P 3"], direction: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:

@@ -1,6 +1,8 @@
 """Losses on blocks of 2 x 2 composited rays against premultiplied target pixels.
 
-All are means over the batch and of order one when the prediction is useless.
+All are means over the batch and of order one when the prediction is useless. A confidence weighs
+the pixels of what compares with a target: where it is low the mean falls too, and the regularisers,
+which take none, have their way.
 """
 
 import math
@@ -18,46 +20,70 @@ MAX_DEPTH_STEP = 5.0  # a plane seen at 79 degrees from its normal
 COLOR_EDGE = 3.0  # a colour step of 1/3 switches smoothing off; Source: SViM3D, bilateral term
 
 
+def _mean(values: Float[Tensor, "*batch C"], weight: Float[Tensor, "*batch 1"] | None) -> Tensor:
+    """Mean of values, each times the weight of its pixel; a weight of one changes no bit."""
+    return values.mean() if weight is None else (weight * values).mean()
+
+
 def tonemap(radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Logarithmic curve with T(0) = 0 and T(1) = 1, unbounded above."""
     return torch.log1p(TONE_CURVE * radiance.clamp_min(0.0)) / math.log1p(TONE_CURVE)
 
 
+def smoothing_guide(
+    radiance: Float[Tensor, "*batch 3"], confidence: Float[Tensor, "*batch 1"] | None
+) -> Float[Tensor, "*batch 3"]:
+    """Picture at whose edges `bilateral_loss` lets go; what is not to be trusted shows none."""
+    picture = tonemap(radiance)
+    return picture if confidence is None else picture * confidence
+
+
 def color_loss(
-    rendered_linear: Float[Tensor, "*batch 3"], target_linear: Float[Tensor, "*batch 3"]
+    rendered_linear: Float[Tensor, "*batch 3"],
+    target_linear: Float[Tensor, "*batch 3"],
+    weight: Float[Tensor, "*batch 1"] | None = None,
 ) -> Float[Tensor, ""]:
     """Mean squared difference of sRGB-encoded colours."""
-    return (srgb_from_linear(rendered_linear) - srgb_from_linear(target_linear)).square().mean()
+    difference = srgb_from_linear(rendered_linear) - srgb_from_linear(target_linear)
+    return _mean(difference.square(), weight)
 
 
 def radiance_loss(
-    rendered: Float[Tensor, "*batch 3"], target: Float[Tensor, "*batch 3"]
+    rendered: Float[Tensor, "*batch 3"],
+    target: Float[Tensor, "*batch 3"],
+    weight: Float[Tensor, "*batch 1"] | None = None,
 ) -> Float[Tensor, ""]:
     """Mean squared difference of tone-mapped radiance."""
-    return (tonemap(rendered) - tonemap(target)).square().mean()
+    return _mean((tonemap(rendered) - tonemap(target)).square(), weight)
 
 
 def mask_loss(
-    rendered: Float[Tensor, "*batch 1"], target: Float[Tensor, "*batch 1"]
+    rendered: Float[Tensor, "*batch 1"],
+    target: Float[Tensor, "*batch 1"],
+    weight: Float[Tensor, "*batch 1"] | None = None,
 ) -> Float[Tensor, ""]:
     """Binary cross-entropy of coverage."""
     return torch.nn.functional.binary_cross_entropy(
-        rendered.clamp(MASK_MARGIN, 1.0 - MASK_MARGIN), target.clamp(0.0, 1.0)
+        rendered.clamp(MASK_MARGIN, 1.0 - MASK_MARGIN), target.clamp(0.0, 1.0), weight
     )
 
 
 def absolute_loss(
-    rendered: Float[Tensor, "*batch C"], target: Float[Tensor, "*batch C"]
+    rendered: Float[Tensor, "*batch C"],
+    target: Float[Tensor, "*batch C"],
+    weight: Float[Tensor, "*batch 1"] | None = None,
 ) -> Float[Tensor, ""]:
     """Mean absolute difference, for normals and for values in [0, 1]."""
-    return (rendered - target).abs().mean()
+    return _mean((rendered - target).abs(), weight)
 
 
 def squared_loss(
-    rendered: Float[Tensor, "*batch C"], target: Float[Tensor, "*batch C"]
+    rendered: Float[Tensor, "*batch C"],
+    target: Float[Tensor, "*batch C"],
+    weight: Float[Tensor, "*batch 1"] | None = None,
 ) -> Float[Tensor, ""]:
     """Mean squared difference, for values in [0, 1]."""
-    return (rendered - target).square().mean()
+    return _mean((rendered - target).square(), weight)
 
 
 def unit_gradient_loss(gradient: Float[Tensor, "N 3"]) -> Float[Tensor, ""]:

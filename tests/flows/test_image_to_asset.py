@@ -1,11 +1,11 @@
 """The real pipeline, tiny: from an orbit folder to files, from the store, and in part."""
 
-import json
 from pathlib import Path
 
 import pytest
 import trimesh
 from sphere_orbit import RADIUS, sphere_cameras, sphere_images
+from tiny_asset import TINY_ASSET, states
 
 from flows import cli
 from flows.pipeline import IMAGE_TO_ASSET
@@ -14,31 +14,6 @@ from svim3d.io.orbit import write_orbit
 
 pytestmark = pytest.mark.flow
 
-TINY = (
-    "env_preopt.size=16",
-    "env_preopt.steps=4",
-    "env_preopt.max_pixels=500",
-    "nerf.steps=40",
-    "nerf.rays_per_step=512",
-    "nerf.grid_nodes=[24, 32]",
-    "nerf.grid_shares=[0, 0.5]",
-    "nerf.coarse_nodes=[8]",
-    "nerf.hash_levels=4",
-    "nerf.hash_log2_entries=11",
-    "nerf.hash_finest=48",
-    "nerf.hidden=16",
-    "nerf.environment_size=16",
-    "dmtet.steps=2",
-    "dmtet.cells=16",
-    "uv_bake.texture_size=64",
-    "uv_bake.max_faces=400",
-    "uv_bake.occlusion_rays=8",
-    "uv_bake.fit_iterations=2",
-    "preview.views=2",
-    "preview.cell=64",
-    "preview.supersample=1",
-)
-
 
 @pytest.fixture(scope="module")
 def command(tmp_path_factory):
@@ -46,18 +21,13 @@ def command(tmp_path_factory):
     root = tmp_path_factory.mktemp("sphere")
     cameras = sphere_cameras(views=9, size=48)
     write_orbit(root / "orbit", cameras, sphere_images(cameras), reference=8)
-    settings = [part for setting in TINY for part in ("--set", setting)]
+    settings = [part for setting in TINY_ASSET for part in ("--set", setting)]
 
     def run(out: Path, *options: str) -> int:
         where = ["-o", str(out), "--store", str(root / "store"), "--device", "cpu"]
         return cli.main(["run", str(root / "orbit"), *where, *settings, *options])
 
     return run
-
-
-def states(out: Path) -> dict[str, str]:
-    page = json.loads((out / "run.json").read_text())
-    return {name: stage["state"] for name, stage in page["stages"].items()}
 
 
 def the_sphere(out: Path) -> trimesh.Trimesh:
@@ -73,26 +43,32 @@ def test_orbit_becomes_an_asset_and_the_second_run_starts_no_engine(
 ):
     out = tmp_path / "out"
     assert command(out) == cli.DONE
-    assert states(out) == dict.fromkeys(IMAGE_TO_ASSET.names, "computed")
+    # There is no photo to prepare.
+    worked = [name for name in IMAGE_TO_ASSET.names if name != "prepare"]
+    assert states(out) == {"prepare": "skipped"} | dict.fromkeys(worked, "computed")
     mesh = the_sphere(out)
     assert mesh.visual.material.baseColorTexture.size == (64, 64)
     assert mesh.visual.material.normalTexture is not None
     assert (out / "environment.exr").is_file()
     assert read_png(out / "preview.png").shape[-1] == 3
-    assert all((out / name / "manifest.json").is_file() for name in IMAGE_TO_ASSET.names)
+    assert read_png(out / "views.png").shape[-1] == 3
+    assert all((out / name / "manifest.json").is_file() for name in worked)
     asset = (out / "asset.glb").read_bytes()
 
     monkeypatch.setattr("flows.job.Engine", None)  # whoever calls it fails
     capsys.readouterr()
     assert command(out) == cli.DONE
-    assert capsys.readouterr().out.count(" cached ") == len(IMAGE_TO_ASSET.names)
+    assert capsys.readouterr().out.count(" cached ") == len(worked)
     assert (out / "asset.glb").read_bytes() == asset
 
 
 @pytest.mark.parametrize("left_out", [["env_preopt"], ["dmtet"], ["env_preopt", "dmtet"]])
 def test_without_a_phase_there_is_still_a_textured_asset(engine, command, tmp_path, left_out):
     assert command(tmp_path, *(f"--skip={name}" for name in left_out)) == cli.DONE
-    assert {name for name, state in states(tmp_path).items() if state == "skipped"} == {*left_out}
+    assert {name for name, state in states(tmp_path).items() if state == "skipped"} == {
+        "prepare",
+        *left_out,
+    }
     assert the_sphere(tmp_path).visual.material.baseColorTexture is not None
 
 

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from sphere_orbit import RADIUS, sphere_cameras, sphere_images
+from spoilt_views import spoilt, trusted, warned
 
 from stages.artifacts import FittedField, MaterialViews, RefinedSurface
 from stages.base import Stage
@@ -90,6 +91,16 @@ def test_the_same_seed_gives_the_same_bytes(views, field, make_context):
     other = DMTET.run(views, field, config=QUICK, ctx=make_context("dmtet", seed=1))
     assert equal(first, again)
     assert not equal(first, other)
+
+
+def test_sure_pixels_change_no_bit_and_doubtful_ones_teach_nothing(views, field, make_context):
+    def refined(shown: MaterialViews) -> RefinedSurface:
+        return DMTET.run(shown, field, config=QUICK, ctx=make_context("dmtet"))
+
+    assert equal(refined(trusted(views)), refined(views))
+    assert equal(refined(spoilt(views)), refined(warned(views)))
+    blind = MaterialViews(**vars(spoilt(views)) | {"confidence": None})
+    assert not equal(refined(blind), refined(warned(views)))
 
 
 def test_a_killed_run_resumes_to_the_same_bytes(views, field, make_context, monkeypatch):

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from sphere_orbit import sphere_cameras, sphere_images
+from spoilt_views import spoilt, trusted, warned
 
 from stages.artifacts import EnvironmentLight, MaterialViews
 from stages.env_preopt import ENV_PREOPT
@@ -115,6 +116,19 @@ def test_same_seed_gives_same_bytes_and_another_draw_other_pixels(make_context, 
     )
     assert again == digests[0]
     assert digests[0] != digests[1]
+
+
+def test_light_counts_each_pixel_by_its_confidence(make_context):
+    config = TINY.model_copy(update={"steps": 4, "max_pixels": 100_000})
+    views = sphere_views(smooth_environment(), roughness=0.2)
+
+    def light(shown):
+        return ENV_PREOPT.run(shown, config=config, ctx=make_context("env_preopt")).radiance
+
+    assert torch.equal(light(trusted(views)), light(views))
+    assert torch.equal(light(spoilt(views)), light(warned(views)))
+    halved = replace(views, confidence=warned(views).confidence * 0.5 + 0.5)
+    assert not torch.equal(light(halved), light(views))
 
 
 def test_resumed_run_ends_with_the_same_bytes(make_context):

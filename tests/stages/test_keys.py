@@ -141,7 +141,7 @@ def test_mesh_digest_covers_files_by_any_spelling_of_their_name(tmp_path, spelli
 
 def test_absent_input_is_refused(tmp_path):
     with pytest.raises(
-        InputError, match="does not exist; give an orbit folder, a mesh or a scene file"
+        InputError, match="does not exist; give a photo, an orbit folder, a mesh or a scene file"
     ):
         digest_input(tmp_path / "nowhere")
 

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 from sphere_orbit import RADIUS, sphere_cameras, sphere_images
+from spoilt_views import spoilt, trusted, warned
 
 from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
 from stages.errors import InputError
@@ -124,6 +125,35 @@ def test_artifact_survives_the_disk(views, make_context, tmp_path):
     assert again.material_spec == fitted.material_spec
 
 
+def test_confidence_of_one_changes_no_bit_and_of_zero_hides_what_is_wrong(views, make_context):
+    # The last steps fit the bump too.
+    config = TINY.model_copy(update={"steps": 6})
+
+    def fitted(shown):
+        return run(shown, None, config=config, ctx=make_context("nerf"))
+
+    assert equal(fitted(trusted(views)), fitted(views))
+    hidden = fitted(spoilt(views))
+    assert equal(hidden, fitted(warned(views)))
+    assert not equal(hidden, fitted(dataclasses.replace(spoilt(views), confidence=None)))
+
+
+def test_a_mask_without_confidence_carves_nothing(views, make_context):
+    """A bite out of one silhouette goes through the whole hull, unless nobody vouches for it."""
+    config = TINY.model_copy(update={"steps": 1})
+    mask, confidence = views.mask.clone(), torch.ones_like(views.mask)
+    mask[8, 16:32, 16:32] = 0.0
+    confidence[8, 16:32, 16:32] = 0.0
+    bitten = dataclasses.replace(views, mask=mask)
+    inside = [
+        int((run(shown, None, config=config, ctx=make_context("nerf")).sdf > 0.0).sum())
+        for shown in (views, bitten, dataclasses.replace(bitten, confidence=confidence))
+    ]
+    assert inside[1] < 0.8 * inside[0]
+    # The one step moves a few nodes across the surface.
+    assert abs(inside[2] - inside[0]) < 0.01 * inside[0]
+
+
 def test_views_larger_than_the_image_size_are_averaged_down(views, make_context):
     config = TINY.model_copy(update={"steps": 30, "image_size": 24})
     assert surface_error(run(views, None, config=config, ctx=make_context("nerf"))) < 0.02
@@ -133,7 +163,7 @@ def only(views, chosen):
     images = {
         f.name: getattr(views, f.name)[chosen]
         for f in dataclasses.fields(views)
-        if f.name not in ("cameras", "reference", "depth")
+        if f.name not in ("cameras", "reference", "depth", "confidence")
     }
     return MaterialViews(cameras=views.cameras[chosen], reference=0, **images)
 

@@ -2,6 +2,7 @@ import dataclasses
 
 import pytest
 import torch
+from spoilt_views import spoilt, trusted, warned
 
 from stages.artifacts import FittedField, MaterialViews, TexturedMesh
 from stages.base import Context
@@ -178,6 +179,20 @@ def test_textures_are_sharpened_against_the_views(ctx):
     for texture, channel in ((mesh.basecolor, 0), (mesh.orm, 1), (mesh.orm, 2)):
         error = (sample_texture(texture, at(mesh.uv))[:, channel, None] - truth).abs()[seen]
         assert error.mean() < 0.1  # the field knows nothing of stripes: 0.27
+
+
+def test_textures_are_sharpened_by_what_can_be_trusted(ctx):
+    config = TINY.model_copy(update={"fit_iterations": 3})
+
+    def textures(views):
+        mesh = run(views, sphere_field(bump=0.0), None, config=config, ctx=ctx)
+        return torch.cat([mesh.basecolor, mesh.orm], -1)
+
+    plain = textures(VIEWS)
+    assert torch.equal(textures(trusted(VIEWS)), plain)
+    hidden = textures(spoilt(VIEWS))
+    assert torch.equal(hidden, textures(warned(VIEWS)))
+    assert not torch.equal(hidden, plain)
 
 
 def test_an_empty_surface_is_an_input_error(ctx):

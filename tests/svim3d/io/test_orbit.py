@@ -4,6 +4,7 @@ import pytest
 import torch
 from sphere_orbit import sphere_cameras, sphere_images
 
+from svim3d.io.exr import read_exr, write_exr
 from svim3d.io.orbit import CHANNELS, read_orbit, write_orbit
 from svim3d.io.orbit_repair import admit_views, repair_images
 
@@ -26,6 +27,31 @@ def test_round_trip_is_bit_exact(tmp_path, cameras, images):
     assert read_cameras.fov_y_deg == cameras.fov_y_deg
     for name in CHANNELS:
         assert torch.equal(read_images[name], images[name]), name
+
+
+def test_confidence_and_depth_are_there_where_all_views_have_them(tmp_path, cameras, images):
+    images["confidence"] = torch.linspace(0, 1, 4).half().float()[:, None, None, None] * torch.ones(
+        4, 16, 16, 1
+    )
+    images["depth"] = images["mask"] * 2.2
+    write_orbit(tmp_path, cameras, images, reference=2)
+    _, read, _ = read_orbit(tmp_path)
+    assert torch.equal(read["confidence"], images["confidence"].half().float())
+    assert torch.equal(read["depth"], images["depth"])
+    planes = read_exr(tmp_path / "001.exr")
+    assert "confidence.V" in planes
+    del planes["confidence.V"]
+    write_exr(tmp_path / "001.exr", planes)
+    assert {"depth"} == set(read_orbit(tmp_path)[1]) - set(CHANNELS)
+
+
+def test_doubtful_confidence_is_mended(images):
+    told = []
+    images["confidence"] = torch.full((4, 16, 16, 1), 0.5)
+    images["confidence"][2, 3, 3] = 1.5
+    mended = repair_images(images, list("abcd"), lambda *event: told.append(event))
+    assert told == [("clamped", "c: 1 values of confidence out of range")]
+    assert float(mended["confidence"].max()) == 1.0
 
 
 def test_files_are_the_same_bytes_each_time(tmp_path, cameras, images):

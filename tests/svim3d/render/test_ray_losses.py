@@ -55,3 +55,33 @@ def test_depth_smoothness_counts_small_steps_only():
         ray_losses.depth_smoothness_loss(slope, mask, 0.01), torch.tensor(want)
     )
     assert float(ray_losses.depth_smoothness_loss(100.0 * slope, mask, 0.01)) == 0.0
+
+
+def test_a_weight_of_one_changes_no_bit_of_value_or_gradient():
+    """Phases 1 and 2 give the same bytes with a uniform confidence as without any."""
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(9, 4, 3, generator=generator)
+    start = torch.rand(9, 4, 3, generator=generator)
+    one, zero = torch.ones(9, 4, 1), torch.zeros(9, 4, 1)
+    for loss, channels in (
+        (ray_losses.color_loss, 3),
+        (ray_losses.radiance_loss, 3),
+        (ray_losses.absolute_loss, 3),
+        (ray_losses.squared_loss, 3),
+        (ray_losses.mask_loss, 1),
+    ):
+        results = []
+        for weight in (None, one, zero):
+            rendered = start[..., :channels].clone().requires_grad_()
+            value = loss(rendered, target[..., :channels], weight)
+            value.backward()
+            results.append((value.detach(), rendered.grad))
+        assert torch.equal(results[0][0], results[1][0]), loss
+        assert torch.equal(results[0][1], results[1][1]), loss
+        assert not results[2][0].any() and not results[2][1].any(), loss
+
+
+def test_an_untrusted_guide_shows_no_edges():
+    radiance = torch.rand(3, 4, 3)
+    assert torch.equal(ray_losses.smoothing_guide(radiance, None), ray_losses.tonemap(radiance))
+    assert not ray_losses.smoothing_guide(radiance, torch.zeros(3, 4, 1)).any()

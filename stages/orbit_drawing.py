@@ -1,0 +1,168 @@
+"""An orbit drawn of one photo: the generator's views, chosen, scaled and put into the world.
+
+The generator knows no distances: its cameras look at the origin from as far as makes the object's
+longest side 1, found by its silhouettes (`svim3d.render.orbit_scale`).
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.artifacts import MaterialViews
+from stages.base import Context
+from stages.photo_artifact import PreparedPhoto
+from stages.settings.generation import GenerationConfig
+from svim3d.cameras import Cameras, orbit_angles, orbit_cameras
+from svim3d.color import linear_from_srgb
+from svim3d.diffusion.agreement import choose
+from svim3d.diffusion.groups import GeneratedViews
+from svim3d.diffusion.guidance import GuidanceInterval
+from svim3d.diffusion.model import MaterialDiffusion, Sampling
+from svim3d.io.model_folder import bundled_model, read_model
+from svim3d.io.orbit_repair import MAX_SHARE_OUTSIDE, admit_views, share_outside
+from svim3d.render.orbit_scale import longest_side
+
+CLOSER = 0.98  # factor on the cameras' distance while views stick out of the object's cube
+CLOSEST = 1.0  # world units; nearer ones would soon stand inside the cube
+SMALLEST_COVERAGE = 1.0 / 510.0  # rounds to 0 of 255; protects the division by coverage
+
+
+def views_of_photo(
+    photo: PreparedPhoto, *, config: GenerationConfig, ctx: Context
+) -> MaterialViews:
+    """Draw views around the object of a photo.
+
+    Raises:
+        ValueError: there is no model, or what it draws is no object before a background.
+    """
+    dtype = _dtype(config, ctx.device)
+    model = read_model(config.model or bundled_model(), ctx.device, dtype)
+    angles = camera_path(config, model.spec.views)
+    samples = draw_samples(model, photo, angles, config, ctx)
+    confidence = None
+    best = samples[0]
+    if len(samples) > 1:
+        chosen, confidence = choose(samples)
+        best = samples[chosen]
+        ctx.event(
+            "sample_chosen",
+            f"sample {chosen} of {len(samples)} is nearest to their mean; mean confidence of the "
+            f"object's pixels {float(confidence[best.mask > 0.5].mean()):.2f}",
+        )
+    if config.keep_photo:
+        best = _with_photo(best, photo)
+    cameras = place_cameras(best, angles, model.spec.fov_deg)
+    try:
+        cameras, images, reference = admit_views(
+            cameras, _images(best, cameras, confidence), len(cameras) - 1, ctx.event
+        )
+    except ValueError as error:
+        raise ValueError(
+            f"the views that the generator drew cannot be used ({error}); try another --seed, or a "
+            "photo that shows the whole object on its own"
+        ) from error
+    return MaterialViews(cameras=cameras, reference=reference, **images)
+
+
+def camera_path(config: GenerationConfig, views: int) -> list[tuple[float, float]]:
+    """Elevation and azimuth of each camera, degrees; the last one is the photo's."""
+    if config.path == "list":
+        return [(elevation, azimuth % 360.0) for elevation, azimuth in config.angles]
+    swing = config.swing_deg if config.path == "sine" else 0.0
+    return orbit_angles(views, config.elevation_deg, swing)
+
+
+def draw_samples(
+    model: MaterialDiffusion,
+    photo: PreparedPhoto,
+    angles: list[tuple[float, float]],
+    config: GenerationConfig,
+    ctx: Context,
+) -> list[GeneratedViews]:
+    """Orbits of one photo; each depends on the run's seed and its own number alone."""
+    elevation, azimuth = torch.tensor(angles).unbind(1)
+    over_white = photo.rgb * photo.mask + (1.0 - photo.mask)
+    conditioning = model.condition(over_white, elevation, azimuth)
+    sampling = Sampling(
+        steps=config.sampler_steps,
+        guidance_max=config.guidance_max,
+        guidance_by=config.guidance_by,
+        interval=GuidanceInterval(*(config.guidance_interval or ())),
+        compiled=config.compiled,
+    )
+    samples = []
+    for number in range(config.samples):
+
+        def report(step: int, steps: int, before: int = number) -> None:
+            ctx.report(before * steps + step, config.samples * steps, {"sample": before + 1})
+
+        seed = ctx.generator(f"sample {number}").initial_seed()
+        latents = model.draw(conditioning, seed, sampling, report)
+        samples.append(_on_cpu(model.decode(latents, sampling)))
+    return samples
+
+
+def place_cameras(
+    views: GeneratedViews, angles: list[tuple[float, float]], fov_y_deg: float
+) -> Cameras:
+    """Cameras at the distance at which the object's longest side is 1.
+
+    Where silhouettes contradict each other, closer: as the object's cube is to hold all of it.
+    """
+    size = views.mask.shape[1]
+    near = orbit_cameras(angles, radius=1.0, fov_y_deg=fov_y_deg, size=size)
+    radius = 1.0 / longest_side(near, views.mask, views.normal_camera)
+    cameras = orbit_cameras(angles, radius=radius, fov_y_deg=fov_y_deg, size=size)
+    while radius > CLOSEST and share_outside(cameras, views.mask) > MAX_SHARE_OUTSIDE:
+        radius *= CLOSER
+        cameras = orbit_cameras(angles, radius=radius, fov_y_deg=fov_y_deg, size=size)
+    return cameras
+
+
+def _dtype(config: GenerationConfig, device: torch.device) -> torch.dtype:
+    if config.dtype == "auto":
+        return torch.bfloat16 if device.type == "cuda" else torch.float32
+    return torch.bfloat16 if config.dtype == "bfloat16" else torch.float32
+
+
+def _on_cpu(views: GeneratedViews) -> GeneratedViews:
+    return GeneratedViews(**{name: image.float().cpu() for name, image in vars(views).items()})
+
+
+def _with_photo(views: GeneratedViews, photo: PreparedPhoto) -> GeneratedViews:
+    """The photo's colours in the last view, as far as both it and the generator see an object.
+
+    The outline stays the generator's: materials and normals end there, and the other views agree
+    with it. Where it goes beyond the photo's, the generated colour stays.
+    """
+    size = views.mask.shape[1]
+    linear = torch.cat([linear_from_srgb(photo.rgb) * photo.mask, photo.mask], -1)
+    scaled = torch.nn.functional.interpolate(
+        linear.permute(2, 0, 1)[None],
+        size=(size, size),
+        mode="bilinear",
+        align_corners=False,
+        antialias=True,
+    )[0].permute(1, 2, 0)
+    share = scaled[..., 3:]
+    straight = scaled[..., :3] / share.clamp_min(SMALLEST_COVERAGE)
+    rgb = views.rgb_linear.clone()
+    rgb[-1] = torch.lerp(rgb[-1], straight, share) * (views.mask[-1] > 0.0)
+    return GeneratedViews(**vars(views) | {"rgb_linear": rgb})
+
+
+def _images(
+    views: GeneratedViews, cameras: Cameras, confidence: Float[Tensor, "K H W 1"] | None
+) -> dict[str, Tensor]:
+    """The images of an orbit, as a reload of their half floats reads them."""
+    normal = torch.einsum("kij,khwj->khwi", cameras.c2w[:, :3, :3], views.normal_camera)
+    images = {
+        "radiance": views.rgb_linear * views.mask,
+        "mask": views.mask,
+        "basecolor": views.basecolor,
+        "roughness": views.roughness,
+        "metallic": views.metallic,
+        "normal_world": normal,
+        **({} if confidence is None else {"confidence": confidence}),
+    }
+    return {name: image.half().float() for name, image in images.items()}
