@@ -1,7 +1,7 @@
 """What the generator is told: the reference view as a token and as a latent, and all cameras."""
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Literal, Self
 
 import torch
 from jaxtyping import Float
@@ -12,6 +12,7 @@ from transformers import CLIPVisionModelWithProjection
 # Mean and standard deviation of the pictures that CLIP was trained on, display-referred RGB.
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+Shrinking = Literal["antialias", "blur"]
 
 
 @dataclass(frozen=True)
@@ -69,15 +70,25 @@ def camera_numbers(
 
 
 def embed_picture(
-    encoder: CLIPVisionModelWithProjection, picture: Float[Tensor, "b 3 H W"]
+    encoder: CLIPVisionModelWithProjection,
+    picture: Float[Tensor, "b 3 H W"],
+    shrink: Shrinking = "antialias",
 ) -> Float[Tensor, "b 1 d"]:
     """The reference view's token: CLIP's pooled and projected answer.
 
     Args:
         encoder: a CLIP image tower of any size.
         picture: display-referred, in [-1, 1].
+        shrink: how it is brought to the encoder's size, as in training: by torch's antialiased
+            bicubic filter, or as SV3D does, see `blur_and_resize`.
     """
-    resized = resize(picture.float(), encoder.config.image_size)
+    side = encoder.config.image_size
+    if shrink == "blur":
+        resized = blur_and_resize(picture.float(), side)
+    else:
+        resized = functional.interpolate(
+            picture.float(), size=(side, side), mode="bicubic", align_corners=False, antialias=True
+        )
     mean = resized.new_tensor(CLIP_MEAN).view(1, 3, 1, 1)
     std = resized.new_tensor(CLIP_STD).view(1, 3, 1, 1)
     pixels = ((resized + 1.0) / 2.0 - mean) / std
@@ -85,7 +96,7 @@ def embed_picture(
     return embedded[:, None]
 
 
-def resize(picture: Float[Tensor, "b c H W"], side: int) -> Float[Tensor, "b c side side"]:
+def blur_and_resize(picture: Float[Tensor, "b c H W"], side: int) -> Float[Tensor, "b c side side"]:
     """The resizing that SV3D was trained with: a Gaussian where it shrinks, then bicubic.
 
     Corners stay corners. Source: kornia's `resize` with `antialias` and `align_corners`.

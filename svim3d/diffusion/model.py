@@ -11,7 +11,12 @@ from torch.nn import functional
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from svim3d.diffusion.autoencoder import Autoencoder, build_autoencoder, decode, encode
-from svim3d.diffusion.conditioning import Conditioning, camera_numbers, embed_picture
+from svim3d.diffusion.conditioning import (
+    Conditioning,
+    Shrinking,
+    camera_numbers,
+    embed_picture,
+)
 from svim3d.diffusion.groups import GROUPS, GeneratedViews, as_network_input, unpack
 from svim3d.diffusion.guidance import (
     GuidanceInterval,
@@ -44,6 +49,7 @@ class ModelSpec:
         guidance_max: strength behind.
         cond_aug: noise that the network believes to be on the reference view.
         transfer: how RGB is encoded for display.
+        shrink: how the image encoder's picture was made smaller in training.
         unet: arguments of `MaterialVideoUNet`.
         autoencoder: arguments of diffusers' `AutoencoderKL` or of `PatchAutoencoder`.
         image_encoder: arguments of transformers' `CLIPVisionConfig`.
@@ -65,6 +71,7 @@ class ModelSpec:
     rho: float = 7.0
     cond_aug: float = 1e-5
     transfer: Literal["srgb"] = "srgb"
+    shrink: Shrinking = "antialias"
     groups: tuple[str, ...] = field(default=GROUPS)
 
     @property
@@ -90,6 +97,7 @@ PAPER = ModelSpec(
     sigma_max=700.0,
     steps=50,
     guidance_max=2.5,
+    shrink="blur",
     unet={
         "in_channels": 20,
         "out_channels": 16,
@@ -215,7 +223,7 @@ class MaterialDiffusion:
             ).clamp(-1.0, 1.0)
         camera = camera_numbers(elevation_deg, azimuth_deg, self.spec.cond_aug)
         return Conditioning(
-            token=embed_picture(self.image_encoder, pictures).float(),
+            token=embed_picture(self.image_encoder, pictures, self.spec.shrink).float(),
             latent=encode(self.autoencoder, pictures),
             camera=camera[None].to(self.device, torch.float32),
         )

@@ -8,9 +8,10 @@ from diffusers.pipelines.stable_video_diffusion.pipeline_stable_video_diffusion 
     _resize_with_antialiasing,
 )
 from tiny_diffusion import some_conditioning, some_latents, tiny_model
+from torch.nn import functional
 
 from svim3d.cameras import CameraPath
-from svim3d.diffusion.conditioning import camera_numbers, embed_picture, resize
+from svim3d.diffusion.conditioning import blur_and_resize, camera_numbers, embed_picture
 
 
 def test_camera_numbers_of_sv3ds_orbit():
@@ -66,12 +67,12 @@ def test_latent_of_the_reference_view_follows_the_noisy_ones_unscaled():
 def test_resizing_is_that_of_stable_video_diffusion(rows, columns, side):
     picture = torch.rand(2, 3, rows, columns, generator=torch.Generator().manual_seed(0))
     theirs = _resize_with_antialiasing(picture, (side, side))
-    assert torch.allclose(resize(picture, side), theirs, atol=1e-6)
+    assert torch.allclose(blur_and_resize(picture, side), theirs, atol=1e-6)
 
 
 def test_resizing_to_the_same_size_changes_nothing():
     picture = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
-    assert resize(picture, 8) is picture
+    assert blur_and_resize(picture, 8) is picture
 
 
 def test_token_is_clips_projected_answer():
@@ -84,3 +85,13 @@ def test_token_is_clips_projected_answer():
     expected = encoder(pixel_values=((picture + 1.0) / 2.0 - mean) / std).image_embeds
     assert token.shape == (1, 1, 16)
     assert torch.allclose(token[:, 0], expected, atol=1e-6)
+
+
+def test_token_of_a_bigger_picture_is_shrunk_as_asked():
+    encoder = tiny_model().image_encoder
+    picture = 2.0 * torch.rand(1, 3, 20, 20, generator=torch.Generator().manual_seed(0)) - 1.0
+    small = functional.interpolate(picture, size=(8, 8), mode="bicubic", antialias=True)
+    assert torch.equal(embed_picture(encoder, picture), embed_picture(encoder, small))
+    blurred = embed_picture(encoder, picture, "blur")
+    assert torch.equal(blurred, embed_picture(encoder, blur_and_resize(picture, 8)))
+    assert not torch.equal(blurred, embed_picture(encoder, picture))

@@ -122,11 +122,3 @@ def test_weights_of_guidance_follow_the_cameras_of_any_path():
     expected = torch.tensor([2.5, 1.75, 1.75, 1.375, 1.0])
     assert torch.allclose(weights, expected, atol=1e-5)
     assert torch.isfinite(model.draw(told, 0, Sampling(steps=1, guidance_by="azimuth"))).all()
-
-
-@pytest.mark.slow
-def test_compiled_blocks_change_nothing():
-    model = tiny_model()
-    told = model.condition(a_picture(), *PATH.tensors())
-    plain, compiled = (model.draw(told, 0, Sampling(steps=2, compiled=c)) for c in (False, True))
-    assert torch.allclose(plain, compiled, atol=1e-4)

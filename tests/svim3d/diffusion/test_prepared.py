@@ -1,5 +1,8 @@
 """The prepared UNet answers as its plain twin does; each of its shortcuts against what it cuts."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 from tiny_diffusion import FRAMES, some_conditioning, some_latents, tiny_unet
@@ -144,6 +147,37 @@ def test_it_computes_less():
     with FlopCounterMode(display=False) as fast:
         prepared(noisy, LEVEL, bound)
     assert fast.get_total_flops() < 0.95 * slow.get_total_flops()
+
+
+COMPILED = """
+import functools, sys
+import torch
+sys.path.insert(0, "tests")
+# Tracing is what can fail; turning graphs into code is torch's own affair and takes minutes.
+torch.compile = functools.partial(torch.compile, backend="eager", fullgraph=True)
+torch._dynamo.config.fail_on_recompile_limit_hit = True
+from tiny_diffusion import some_conditioning, some_latents, tiny_unet
+from svim3d.diffusion.prepared import PreparedUNet
+answers, level = [], torch.tensor([0.3])
+unet, noisy = tiny_unet(), some_latents()
+for compiled in (False, True, True):
+    prepared = PreparedUNet(unet, compiled=compiled)
+    answers.append(prepared(noisy, level, prepared.bind(some_conditioning())))
+    graphs = torch._dynamo.utils.counters["stats"]["unique_graphs"]
+    print(graphs, float((answers[-1] - answers[0]).abs().max()))
+"""
+
+
+def test_blocks_compile_whole_and_a_second_orbit_finds_them_compiled():
+    # In a process of its own: here every function is wrapped to check shapes.
+    ran = subprocess.run(
+        [sys.executable, "-c", COMPILED], capture_output=True, text=True, check=True
+    )
+    plain, first, again = (line.split() for line in ran.stdout.splitlines())
+    assert plain == ["0", "0.0"]
+    assert first == again
+    assert int(first[0]) > 0
+    assert float(first[1]) < 1e-5
 
 
 def test_sides_that_cannot_be_halved_are_refused():
