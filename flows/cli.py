@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
+from flows.data_options import data_options
 from flows.options import edit_options, job_options, relight_options
 
 DONE, FAILED, BAD_INPUT, CANCELLED = 0, 1, 2, 130
@@ -61,6 +62,10 @@ def _dispatch(options: argparse.Namespace) -> int:
         from flows.edit import edit
 
         return edit(options)
+    if options.command == "data":
+        from flows.data import data
+
+        return data(options)
     from flows import commands
 
     if options.command == "presets":
@@ -102,6 +107,7 @@ def _parser() -> argparse.ArgumentParser:
         ("run", [job, shared], "make the asset; finished stages are taken from the store"),
         ("relight", [relight_options(), shared], "show views or an asset under another light"),
         ("edit", [edit_options(), shared], "write an asset with other materials"),
+        ("data", [data_options(), shared], "render training data for the generator"),
         ("plan", [job, shared], "say which stages a run would compute, and why"),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),

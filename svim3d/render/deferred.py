@@ -182,7 +182,7 @@ def render_mesh(
     stacked = torch.cat([geometry.vertices, geometry.normals, clip[:, 3:], geometry.attributes], 1)
     pixels, values = interpolate(clip, geometry.faces, fragments, stacked)
     wo = normalize(cameras.positions[view] - values[:, :3])
-    points = _surface_points(geometry, values, fragments.triangle.reshape(-1)[pixels].long(), wo)
+    points = surface_points(geometry, values, fragments.triangle.reshape(-1)[pixels].long(), wo)
     channels = torch.cat(
         [torch.ones_like(wo[:, :1]), *_material_channels(points, materials, values, wo, shader)], 1
     )
@@ -196,7 +196,7 @@ def render_mesh(
     return RenderedView(*torch.split(image, CHANNELS, -1))
 
 
-def _surface_points(
+def surface_points(
     geometry: Geometry,
     values: Float[Tensor, "P C"],
     face: Int[Tensor, "P"],

@@ -5,6 +5,7 @@ environment without visibility or interreflection, so that cavities are as brigh
 """
 
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from jaxtyping import Float, Int
@@ -61,14 +62,7 @@ def _images(
     names: tuple[str, ...],
 ) -> dict[str, Float[Tensor, "_ _ _ _"]]:
     """The named images of all views."""
-    geometry = Geometry(
-        vertices=mesh.vertices,
-        faces=mesh.faces,
-        normals=mesh.normals,
-        attributes=torch.cat([mesh.uv, mesh.tangents, mesh.colors], 1),
-        two_sided=True,
-    )
-    materials = _MeshMaterials(mesh.face_material.long(), mesh.materials)
+    geometry, materials = mesh_geometry(mesh), MeshMaterials.of(mesh)
     views = [
         render_mesh(
             geometry, materials, cameras, view=view, shader=shader, supersample=supersample
@@ -78,12 +72,28 @@ def _images(
     return {name: torch.stack([getattr(view, name) for view in views]) for name in names}
 
 
+def mesh_geometry(mesh: SourceMesh) -> Geometry:
+    """The mesh with what `MeshMaterials` reads at its vertices; both sides of a face are seen."""
+    return Geometry(
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+        normals=mesh.normals,
+        attributes=torch.cat([mesh.uv, mesh.tangents, mesh.colors], 1),
+        two_sided=True,
+    )
+
+
 @dataclass(frozen=True)
-class _MeshMaterials:
+class MeshMaterials:
     """The materials of a `SourceMesh` at its visible points."""
 
     face_material: Int[Tensor, "F"]
     materials: tuple[SourceMaterial, ...]
+
+    @classmethod
+    def of(cls, mesh: SourceMesh) -> Self:
+        """The materials of a mesh that is rendered as `mesh_geometry` has it."""
+        return cls(mesh.face_material.long(), mesh.materials)
 
     def __call__(self, points: SurfacePoints) -> Materials:
         """Evaluate one material after another, each at the points that show it."""

@@ -1,0 +1,228 @@
+"""Training data: examples rendered into a folder, one file each, by any number of processes.
+
+Reads meshes and environments where some are named; writes `NNNNNN.safetensors` and `dataset.json`.
+Example i of a seed is always the same, so a folder can grow, and a run that was stopped goes on
+where it was: whole files are kept, the rest is made.
+"""
+
+import functools
+import json
+import multiprocessing
+import os
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.errors import InputError
+from stages.prefilter_cache import cached_operator
+from svim3d.io.glb import read_mesh
+from svim3d.io.light import SUFFIXES as LIGHT_SUFFIXES
+from svim3d.io.light import read_light
+from svim3d.io.obj import read_obj
+from svim3d.io.training_data import example_file, is_whole, read_example_metadata, write_example
+from svim3d.mesh.source_mesh import SourceMesh, normalised
+from svim3d.synthesis.examples import FOV_DEG, render_example
+from svim3d.synthesis.lights import SIZE
+
+SUMMARY = "dataset.json"
+MESH_SUFFIXES = (".glb", ".gltf", ".obj")
+# One thread a process: the pictures are small, and as many processes as cores are wanted anyway.
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+KEPT_MESHES = 4  # that a process holds: examples of one mesh are far apart
+
+Status = Literal["made", "kept", "skipped"]
+
+
+@dataclass(frozen=True)
+class DataRequest:
+    """What to render.
+
+    Attributes:
+        folder: where the files go.
+        seed: of everything that is drawn.
+        size: side of the pictures, pixels.
+        views: per example; the last is the reference.
+        lights: per example.
+        meshes: files to show one after the other, over and over; none invents objects.
+        environments: files that every other light is taken from; none invents all lights.
+        cache: folder of derived data that runs share.
+    """
+
+    folder: Path
+    seed: int
+    size: int
+    views: int
+    lights: int
+    meshes: tuple[Path, ...]
+    environments: tuple[Path, ...]
+    cache: Path
+
+    def settings(self) -> dict[str, Any]:
+        """What all examples of a folder have in common."""
+        return {
+            "seed": self.seed,
+            "size": self.size,
+            "views": self.views,
+            "lights": self.lights,
+            "fov_deg": FOV_DEG,
+            "meshes": [file.name for file in self.meshes],
+            "environments": [file.name for file in self.environments],
+        }
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one example.
+
+    Attributes:
+        index: of the example.
+        status: made now, kept from before, or skipped because its mesh cannot be read.
+        message: why it was skipped.
+    """
+
+    index: int
+    status: Status
+    message: str = ""
+
+
+def files_in(folder: Path | None, suffixes: tuple[str, ...], what: str) -> tuple[Path, ...]:
+    """The files of a folder, by name; none without a folder.
+
+    Raises:
+        InputError: there is no such folder, or nothing in it.
+    """
+    if folder is None:
+        return ()
+    if not folder.is_dir():
+        raise InputError(f"there is no folder {folder}; name one with {what}")
+    found = sorted(f for f in folder.rglob("*") if f.suffix.lower() in suffixes)
+    if not found:
+        raise InputError(f"wanted {what} ({', '.join(suffixes)}) in {folder}, but there are none")
+    return tuple(found)
+
+
+def mesh_files(folder: Path | None) -> tuple[Path, ...]:
+    """Meshes in a folder and below; see `files_in`."""
+    return files_in(folder, MESH_SUFFIXES, "meshes")
+
+
+def environment_files(folder: Path | None) -> tuple[Path, ...]:
+    """Environments in a folder and below; see `files_in`."""
+    return files_in(folder, LIGHT_SUFFIXES, "environments")
+
+
+def render_data(request: DataRequest, objects: int, workers: int) -> Iterator[Outcome]:
+    """Make what is missing of examples 0 to `objects` - 1, and tell of each when it is there.
+
+    `dataset.json` is written first, with the settings, and again at the end, with counts.
+
+    Raises:
+        InputError: the folder holds data of other settings, or cannot be written.
+    """
+    _claim(request)
+    # Compiled or read once here, so that the processes find it ready.
+    cached_operator(request.cache, SIZE)
+    tally = Counter[Status]()
+    for outcome in _outcomes(request, range(objects), workers):
+        tally[outcome.status] += 1
+        yield outcome
+    _write_summary(request, {"skipped": tally["skipped"], **_counts(request.folder)})
+
+
+def _outcomes(request: DataRequest, indices: range, workers: int) -> Iterator[Outcome]:
+    """Examples as they are made, in order; by processes of one thread each."""
+    make = functools.partial(make_example, request)
+    if workers <= 1:
+        yield from map(make, indices)
+        return
+    for name, value in ONE_THREAD.items():
+        os.environ[name] = value
+    # Fresh processes: a fork would share locks of thread pools that may be held.
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, mp_context=context)
+    try:
+        yield from pool.map(make, indices, chunksize=4)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def make_example(request: DataRequest, index: int) -> Outcome:
+    """Render and write one example, unless it is there."""
+    torch.set_num_threads(1)
+    file = example_file(request.folder, index)
+    if is_whole(file):
+        return Outcome(index, "kept")
+    mesh = None
+    if request.meshes:
+        path = request.meshes[index % len(request.meshes)]
+        try:
+            mesh = (path.stem, _mesh(path))
+        except Exception as error:  # of any kind: one broken file must not end the run
+            return Outcome(index, "skipped", f"{path} was left out: {error}")
+    example = render_example(
+        request.seed,
+        index,
+        cached_operator(request.cache, SIZE),
+        size=request.size,
+        views=request.views,
+        lights=request.lights,
+        mesh=mesh,
+        maps=_maps(request.environments),
+    )
+    write_example(file, example)
+    return Outcome(index, "made")
+
+
+@functools.lru_cache(maxsize=KEPT_MESHES)
+def _mesh(file: Path) -> SourceMesh:
+    mesh = read_obj(file) if file.suffix.lower() == ".obj" else read_mesh(file)
+    return normalised(mesh, file.name)
+
+
+@functools.lru_cache(maxsize=1)
+def _maps(files: tuple[Path, ...]) -> tuple[tuple[str, Float[Tensor, "n n 3"]], ...]:
+    """Names and octahedral maps of environment files."""
+    return tuple((file.stem, read_light(file).octahedral(SIZE)) for file in files)
+
+
+def _claim(request: DataRequest) -> None:
+    """Make the folder, or see that it holds data of the same settings."""
+    file = request.folder / SUMMARY
+    try:
+        request.folder.mkdir(parents=True, exist_ok=True)
+        if file.is_file():
+            there = json.loads(file.read_text())
+            other = {k: there.get(k) for k, v in request.settings().items() if there.get(k) != v}
+            if other:
+                raise InputError(
+                    f"{request.folder} holds data of other settings ({other}); use those, or "
+                    "choose another folder"
+                )
+        else:
+            _write_summary(request, {})
+    except (OSError, json.JSONDecodeError) as error:
+        raise InputError(f"{request.folder} cannot be used: {error}") from error
+
+
+def _counts(folder: Path) -> dict[str, Any]:
+    """How many examples of which quality and name a folder holds."""
+    about = [read_example_metadata(file) for file in sorted(folder.glob("*.safetensors"))]
+    return {
+        "objects": len(about),
+        "quality": dict(sorted(Counter(a["quality"] for a in about).items())),
+        "names": dict(sorted(Counter(a["name"] for a in about).items())),
+    }
+
+
+def _write_summary(request: DataRequest, counts: dict[str, Any]) -> None:
+    """Write `dataset.json` in one step."""
+    temporary = request.folder / f".{SUMMARY}.tmp"
+    temporary.write_text(json.dumps({**request.settings(), **counts}, indent=2) + "\n")
+    temporary.replace(request.folder / SUMMARY)

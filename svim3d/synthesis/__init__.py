@@ -1,0 +1,1 @@
+"""Invented objects, materials, lights and camera paths: what a model is trained on."""
