@@ -48,8 +48,15 @@ from generator_report import (  # noqa: E402
 )
 from generator_scores import FIGURES, score_views, turning  # noqa: E402
 from generator_sheets import case_sheet, stack_sheets  # noqa: E402
-from generator_views import Case, Views, read_examples, read_orbit_case  # noqa: E402
+from generator_views import (  # noqa: E402
+    Case,
+    Views,
+    read_examples,
+    read_orbit_case,
+    read_photo_case,
+)
 
+from stages.errors import InputError  # noqa: E402
 from svim3d.diffusion.model import MaterialDiffusion, Sampling  # noqa: E402
 from svim3d.io.image import write_png  # noqa: E402
 from svim3d.io.model_folder import read_model  # noqa: E402
@@ -140,6 +147,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--train-limit", type=int, default=TRAIN_LIMIT)
     parser.add_argument("--heldout", type=Path)
     parser.add_argument("--data", type=Path, default=os.environ.get("SVIM3D_DATA"))
+    parser.add_argument("--photos", type=Path, help="folder; for sheets (default: --data's photos)")
+    parser.add_argument("--network", type=Path, help="matting network (.onnx) for photos")
     parser.add_argument("--limit", type=int, help="objects of the held-out folder")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--samples", type=int, default=1, help="orbits per object; adds their mean")
@@ -153,6 +162,8 @@ def parse() -> argparse.Namespace:
     arguments = parser.parse_args()
     if arguments.heldout is None and arguments.data is None:
         parser.error("nothing to judge on: give --heldout, or --data (no SVIM3D_DATA is set)")
+    if arguments.photos is None and arguments.data is not None:
+        arguments.photos = Path(arguments.data) / "photos"
     return arguments
 
 
@@ -188,6 +199,25 @@ def main() -> None:
             file = arguments.sheet.with_stem(f"{arguments.sheet.stem}-{name.split(',')[0]}")
             write_sheet(file, kept, compact=arguments.compact)
     print(f"results: {arguments.results}")
+    if arguments.sheet is not None and arguments.photos is not None:
+        kept = draw_photos(model, arguments, sampling)
+        write_sheet(arguments.sheet.with_stem(f"{arguments.sheet.stem}-photos"), kept)
+
+
+def draw_photos(
+    model: MaterialDiffusion, arguments: argparse.Namespace, sampling: Sampling
+) -> list[tuple[Case, Views]]:
+    """Photos that can be cut out, and what the generator makes of them."""
+    kept = []
+    for file in sorted(arguments.photos.iterdir()):
+        try:
+            case = read_photo_case(file, model.spec.image_size, model.spec.views, arguments.network)
+        except InputError as error:
+            print(f"{file.name}: left out: {error}", flush=True)
+            continue
+        kept.append((case, generate(model, case, object_seed(arguments.seed, len(kept)), sampling)))
+        print(f"{file.name}: drawn", flush=True)
+    return kept
 
 
 def choices(training: Training) -> dict:
@@ -202,7 +232,7 @@ def choices(training: Training) -> dict:
     }
 
 
-def write_sheet(file: Path, kept: list[tuple[Case, Views]], *, compact: bool) -> None:
+def write_sheet(file: Path, kept: list[tuple[Case, Views]], *, compact: bool = False) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     sheets = [case_sheet(case, ours, compact=compact) for case, ours in kept]
     write_png(file, stack_sheets(sheets))

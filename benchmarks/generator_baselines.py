@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import torch
-from generator_scores import score_views
+from generator_scores import angle_deg, decibels, masked_mean
 from generator_views import COVERED, Case, Views, over_white
 from generator_warp import Warp, fit_ellipsoid, inflated_normals, warp_views
 from torch import Tensor
@@ -20,7 +20,7 @@ from svim3d.numerics import normalize
 Baseline = Callable[[Case], Views]
 
 BINS = 21  # azimuths of the mean images
-CHOICE_OBJECTS = 32  # training objects on which variants compete
+CHOICE_OBJECTS = 16  # training objects on which variants compete
 SCALES = (1.0, 1.1, 1.2)  # of the ellipsoid: corners of boxes stick out of what fits their mask
 LEVELS = 101  # of the constants that are tried
 
@@ -185,23 +185,29 @@ def _fit_tone(sums: Tensor) -> Tone:
 def _choose(training: Training, cases: list[Case]) -> Training:
     """Take the variants that do best on training objects."""
 
-    def mean_score(baseline: Baseline, name: str) -> float:
-        scores = [score_views(baseline(c), c.truth, training.mean_value)[name] for c in cases]
-        return float(torch.stack([s[:-1].nanmean() for s in scores]).mean())
+    def mean_of(score: Callable[[Views, Views], Tensor], baseline: Baseline) -> float:
+        scores = [score(baseline(case), case.truth)[:-1].mean() for case in cases]
+        return float(torch.stack(scores).mean())
+
+    def rgb_psnr(found: Views, truth: Views) -> Tensor:
+        return decibels((found.rgb - truth.rgb).square().mean((1, 2, 3)))
+
+    def normal_deg(found: Views, truth: Views) -> Tensor:
+        return masked_mean(angle_deg(found.normal, truth.normal), truth.mask > COVERED)
 
     variants = [Warp(scale, carves) for scale in SCALES for carves in (False, True)]
-    scored = {
-        warp: mean_score(lambda c, w=warp: warped(c, replace(training, warp=w)), "rgb_psnr")
+    psnr = {
+        warp: mean_of(rgb_psnr, lambda c, w=warp: warped(c, replace(training, warp=w)))
         for warp in variants
     }
-    training = replace(training, warp=max(scored, key=lambda w: scored[w]))
-    angles = {
-        choice: mean_score(
-            lambda c, r=choice: repeated(c, replace(training, repeats_mean_normals=r)), "normal_deg"
+    training = replace(training, warp=max(psnr, key=lambda w: psnr[w]))
+    angle = {
+        choice: mean_of(
+            normal_deg, lambda c, r=choice: repeated(c, replace(training, repeats_mean_normals=r))
         )
         for choice in (False, True)
     }
-    return replace(training, repeats_mean_normals=angles[True] < angles[False])
+    return replace(training, repeats_mean_normals=angle[True] < angle[False])
 
 
 def repeated(case: Case, training: Training) -> Views:

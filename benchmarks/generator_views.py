@@ -4,6 +4,7 @@ All colours are sRGB over white, normals those of the camera, everything at the 
 """
 
 import json
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,17 +12,21 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from stages.base import Context
+from stages.prepare import PREPARE
+from stages.settings.prepare import PrepareConfig
 from svim3d.cameras import orbit_angles
 from svim3d.color import linear_from_srgb, srgb_from_linear
 from svim3d.diffusion.groups import SMALLEST_COVERAGE, GeneratedViews, without_background
 from svim3d.io.image import read_png
 from svim3d.io.orbit import read_orbit
-from svim3d.io.weights import load_tensors
+from svim3d.io.training_data import read_example
 from svim3d.numerics import normalize
 
 COVERED = 0.5  # coverage above which a pixel shows the object
 FILL, BORDER = 0.9, 0.96  # training's framing: of the reference view, and of all views
-FOV_DEG = 33.8  # of an example that does not say, and of photos
+FOV_DEG = 33.8  # assumed of photos
+PHOTO_OVERSIZE = 4  # photos are cut out at this multiple of the model's size
 PHOTO_ELEVATION_DEG = 10.0  # assumed: the elevation at which SV3D stands unless told
 
 
@@ -134,32 +139,27 @@ def resample(pictures: Tensor, size: int, zoom: float = 1.0) -> Tensor:
     return torch.einsum("ai,bj,...ijc->...abc", weights, weights, pictures)
 
 
-def read_example(file: Path, size: int, light: int) -> Case:
+def read_case(file: Path, size: int, light: int) -> Case:
     """A training example as a case, under one of its lights."""
-    stored = load_tensors(file)
-    described = read_description(file)
-    planes = {name: stored[name].float() / 255.0 for name in ("basecolor", "orm", "normal", "mask")}
-    planes["rgb"] = stored["rgb"][light % len(stored["rgb"])].float() / 255.0
-    if planes["rgb"].shape[-2] != size:
+    stored = read_example(file)
+    planes = {
+        name: getattr(stored, name).float() / 255.0
+        for name in ("basecolor", "orm", "normal", "mask")
+    }
+    planes["rgb"] = stored.rgb[light % len(stored.rgb)].float() / 255.0
+    if planes["mask"].shape[-2] != size:
         planes = {name: resample(plane, size) for name, plane in planes.items()}
     truth = Views.of_pictures(planes, planes["mask"])
     return Case(
-        name=described.get("name", file.stem),
+        name=f"{file.stem} {stored.metadata['name']}",
         picture=truth.rgb[-1],
         mask=truth.mask[-1],
-        elevation_deg=stored["elevation_deg"].float(),
-        azimuth_deg=stored["azimuth_deg"].float(),
-        fov_deg=float(described.get("fov_deg", FOV_DEG)),
+        elevation_deg=stored.elevation_deg,
+        azimuth_deg=stored.azimuth_deg,
+        fov_deg=float(stored.metadata["fov_deg"]),
         truth=truth,
-        has_materials=described.get("quality", "high") != "low",
+        has_materials=stored.metadata["quality"] != "low",
     )
-
-
-def read_description(file: Path) -> dict[str, str]:
-    """The metadata of a safetensors file: JSON behind eight bytes of its length."""
-    with file.open("rb") as stream:
-        length = int.from_bytes(stream.read(8), "little")
-        return json.loads(stream.read(length)).get("__metadata__", {})
 
 
 def example_files(folder: Path) -> list[Path]:
@@ -179,7 +179,7 @@ def read_examples(folder: Path, size: int, limit: int | None = None) -> Iterator
     files = example_files(folder)
     count = len(files) if limit is None else min(limit, len(files))
     for index in range(count):
-        yield read_example(files[index * len(files) // count], size, light=index)
+        yield read_case(files[index * len(files) // count], size, light=index)
 
 
 def framing_zoom(mask: Tensor) -> float:
@@ -237,14 +237,28 @@ def read_orbit_case(folder: Path, size: int) -> Case:
 def read_cut_out(file: Path, size: int, zoom: float) -> tuple[Tensor, Tensor]:
     """A picture with opacity, zoomed: over white, and its coverage."""
     stored = read_png(file)
-    opacity = stored[..., 3:]
-    mask = resample(opacity, size, zoom)
-    light = resample(linear_from_srgb(stored[..., :3]) * opacity, size, zoom)
-    straight = srgb_from_linear(light / mask.clamp(min=SMALLEST_COVERAGE))
-    return over_white(straight, mask), mask
+    return shrink_cut_out(stored[..., :3], stored[..., 3:], size, zoom)
 
 
-def photo_case(name: str, picture: Tensor, mask: Tensor, views: int) -> Case:
-    """A masked photo, asked for all around at one elevation."""
+def shrink_cut_out(
+    straight: Tensor, coverage: Tensor, size: int, zoom: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    """A display-referred picture resampled in linear light: over white, and its coverage."""
+    mask = resample(coverage, size, zoom)
+    light = resample(linear_from_srgb(straight) * coverage, size, zoom)
+    shown = srgb_from_linear(light / mask.clamp(min=SMALLEST_COVERAGE))
+    return over_white(shown, mask), mask
+
+
+def read_photo_case(file: Path, size: int, views: int, network: Path | None) -> Case:
+    """A photo as the prepare stage cuts it out, asked for all around at one elevation."""
+    config = PrepareConfig(size=size * PHOTO_OVERSIZE, network=network)
+    cpu = torch.device("cpu")
+    with (
+        tempfile.TemporaryDirectory() as work,
+        Context("prepare", cpu, 0, Path(work), Path(work)) as ctx,
+    ):
+        prepared = PREPARE.run(file, config=config, ctx=ctx)
+    picture, mask = shrink_cut_out(prepared.rgb, prepared.mask, size)
     elevation, azimuth = torch.tensor(orbit_angles(views, PHOTO_ELEVATION_DEG, 0.0)).unbind(-1)
-    return Case(name, picture, mask, elevation, azimuth, FOV_DEG, truth=None)
+    return Case(file.stem, picture, mask, elevation, azimuth, FOV_DEG, truth=None)
