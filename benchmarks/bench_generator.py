@@ -23,9 +23,8 @@ import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
-sys.path.insert(0, str(ROOT / "benchmarks"))
 
-from generator_baselines import (  # noqa: E402
+from benchmarks.generator_baselines import (  # noqa: E402
     Training,
     learn,
     mean_image,
@@ -33,8 +32,8 @@ from generator_baselines import (  # noqa: E402
     repeated_truth,
     warped,
 )
-from generator_draws import generate, mean_of, object_seed, round_trip  # noqa: E402
-from generator_report import (  # noqa: E402
+from benchmarks.generator_draws import generate, mean_of, object_seed, round_trip  # noqa: E402
+from benchmarks.generator_report import (  # noqa: E402
     OURS,
     SHORT,
     Scores,
@@ -46,16 +45,15 @@ from generator_report import (  # noqa: E402
     turning_table,
     verdict,
 )
-from generator_scores import FIGURES, score_views, turning  # noqa: E402
-from generator_sheets import case_sheet, stack_sheets  # noqa: E402
-from generator_views import (  # noqa: E402
+from benchmarks.generator_scores import FIGURES, score_views, turning  # noqa: E402
+from benchmarks.generator_sheets import case_sheet, stack_sheets  # noqa: E402
+from benchmarks.generator_views import (  # noqa: E402
     Case,
     Views,
     read_examples,
     read_orbit_case,
     read_photo_case,
 )
-
 from stages.errors import InputError  # noqa: E402
 from svim3d.diffusion.model import MaterialDiffusion, Sampling  # noqa: E402
 from svim3d.io.image import write_png  # noqa: E402

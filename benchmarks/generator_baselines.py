@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import torch
-from generator_scores import angle_deg, decibels, masked_mean
-from generator_views import COVERED, Case, Views, over_white
-from generator_warp import Warp, fit_ellipsoid, inflated_normals, warp_views
 from torch import Tensor
 
+from benchmarks.generator_scores import angle_deg, decibels, masked_mean
+from benchmarks.generator_views import COVERED, Case, Views, over_white
+from benchmarks.generator_warp import Warp, fit_ellipsoid, inflated_normals, warp_views
 from svim3d.diffusion.groups import without_background
 from svim3d.numerics import normalize
 
@@ -137,7 +137,7 @@ def _without_choices(sums: _Sums, objects: int) -> Training:
     value = {
         name: float(sums.planes[name].sum() / known.sum().clamp(min=1.0)) for name in sums.spreads
     }
-    mask = ((sums.planes["mask"] / count) >= COVERED).float()
+    mask = ((sums.planes["mask"] / count) > COVERED).float()
     # Where training shows nothing at all, the mean value stands for the mean image.
     images = {
         name: torch.where(known > 0.0, sums.planes[name] / known.clamp(min=1e-6), value[name])

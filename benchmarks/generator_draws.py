@@ -1,9 +1,9 @@
 """Orbits of the generator, and the bounds that its autoencoder sets."""
 
 import torch
-from generator_views import Case, Views
 from torch import Tensor
 
+from benchmarks.generator_views import Case, Views
 from svim3d.diffusion.autoencoder import encode
 from svim3d.diffusion.groups import as_network_input
 from svim3d.diffusion.model import MaterialDiffusion, Sampling
@@ -18,9 +18,16 @@ def object_seed(seed: int, index: int) -> int:
 
 
 def generate(model: MaterialDiffusion, case: Case, seed: int, sampling: Sampling) -> Views:
-    """One orbit, at the cameras of a case."""
+    """One orbit, at the cameras of a case.
+
+    Raises:
+        ValueError: the model's answer is not finite: no figure could be made of it.
+    """
     told = model.condition(case.picture, case.elevation_deg, case.azimuth_deg)
-    return Views.of_generated(model.decode(model.draw(told, seed, sampling), sampling))
+    latents = model.draw(told, seed, sampling)
+    if not bool(latents.isfinite().all()):
+        raise ValueError(f"wanted finite latents of {case.name}, got others; check the weights")
+    return Views.of_generated(model.decode(latents, sampling))
 
 
 @torch.no_grad()

@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass
 
 import torch
-from generator_views import COVERED, Views
 from torch import Tensor
 
+from benchmarks.generator_views import COVERED, Views
 from svim3d.metrics import structural_similarity
 from svim3d.numerics import dot, normalize
 

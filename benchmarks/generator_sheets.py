@@ -1,25 +1,26 @@
 """Sheets of generated views beside true ones."""
 
 import torch
-from generator_views import Case, Views
 from torch import Tensor
 from torch.nn import functional
 
+from benchmarks.generator_views import Case, Views
 from svim3d.io.image import Label, with_labels
 
 COLUMNS = 8  # azimuths of a sheet
 ENLARGE = 2  # of a view: at 64 px details are hard to see
 LABEL_PX, GAP_PX, TEXT_PX, TITLE_PX = 104, 4, 12, 18
 PAPER, INK = 1.0, 0.15
+BACKDROP = (0.72, 0.80, 0.92)  # behind greys, which reach from black to white
 TRUTH, OURS = "true", "ours"
 
 
 def rows_of(views: Views, who: str) -> dict[str, Tensor]:
-    """The pictures of views by label, [K, H, W, 3], scalars as grey over white."""
+    """The pictures of views by label, [K, H, W, 3], scalars as grey."""
     pictures = views.pictures()
     backdrop = 1.0 - views.mask
     grey = {
-        name: (getattr(views, name) * views.mask + backdrop).expand(-1, -1, -1, 3)
+        name: getattr(views, name) * views.mask + backdrop * torch.tensor(BACKDROP)
         for name in ("roughness", "metallic")
     }
     normal = pictures["normal"] + backdrop

@@ -136,7 +136,8 @@ def resample(pictures: Tensor, size: int, zoom: float = 1.0) -> Tensor:
     side = pictures.shape[-2]
     length = side / zoom
     weights = window_weights(side, size, (side - length) / 2.0, length)
-    return torch.einsum("ai,bj,...ijc->...abc", weights, weights, pictures)
+    rows = torch.einsum("ai,...ijc->...ajc", weights, pictures)
+    return torch.einsum("bj,...ajc->...abc", weights, rows)
 
 
 def read_case(file: Path, size: int, light: int) -> Case:

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from generator_views import COVERED, Case
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import diags
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 from torch.nn import functional
 
+from benchmarks.generator_views import COVERED, Case
 from svim3d.cameras import Cameras, orbit_cameras
 from svim3d.numerics import dot, normalize
 
