@@ -82,13 +82,25 @@ def outline_box(body: Ellipsoid, camera: Cameras) -> Tensor:
 
 def mask_box(mask: Tensor, fov_deg: float) -> Tensor:
     """Left, right, bottom and top of a mask, as slopes from the camera's axis."""
-    covered = mask[..., 0] > COVERED
-    height, width = covered.shape
+    height, width = mask.shape[:2]
     focal = 0.5 * height / math.tan(math.radians(fov_deg) / 2)
-    columns, rows = (torch.nonzero(covered.any(axis))[:, 0] for axis in (0, 1))
-    left, right = float(columns.min()) - width / 2, float(columns.max()) + 1 - width / 2
-    top, bottom = height / 2 - float(rows.min()), height / 2 - float(rows.max()) - 1
-    return torch.tensor([left, right, bottom, top]) / focal
+    left, right = _extent(mask[..., 0].amax(0))
+    top, bottom = _extent(mask[..., 0].amax(1))
+    edges = [left - width / 2, right - width / 2, height / 2 - bottom, height / 2 - top]
+    return torch.tensor(edges) / focal
+
+
+def _extent(profile: Tensor) -> tuple[float, float]:
+    """Where a row of coverages begins and ends, to a fraction of a pixel.
+
+    Of the first covered pixel and of the one before it, the covered shares count.
+    """
+    inside = torch.nonzero(profile > COVERED)[:, 0]
+    first, last = int(inside[0]), int(inside[-1])
+    shares = functional.pad(profile, (1, 1))  # share i is that of pixel i - 1
+    begin = first + 1.0 - float(shares[first + 1] + shares[first])
+    end = last + float(shares[last + 1] + shares[last + 2])
+    return begin, end
 
 
 def fit_ellipsoid(mask: Tensor, elevation_deg: float, fov_deg: float) -> Ellipsoid:

@@ -35,7 +35,8 @@ TINY = ModelSpec(
         "attention": [False, False],
     },
     autoencoder={
-        "block_out_channels": [32, 32, 32],
+        "block_out_channels": [8, 8, 8],
+        "norm_num_groups": 8,
         "down_block_types": ["DownEncoderBlock2D"] * 3,
         "up_block_types": ["UpDecoderBlock2D"] * 3,
         "latent_channels": 4,
