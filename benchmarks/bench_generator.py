@@ -153,7 +153,9 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--steps", type=int)
     parser.add_argument("--guidance", type=float)
     parser.add_argument("--guidance-by", choices=("index", "azimuth"), default="index")
-    parser.add_argument("--sheet", type=Path, help="PNG; a name per set is put before its suffix")
+    parser.add_argument(
+        "--sheet", type=Path, help="PNG; the name of each set is put before its suffix"
+    )
     parser.add_argument("--sheet-objects", type=int, default=SHEET_OBJECTS)
     parser.add_argument("--compact", action="store_true", help="sheets with RGB of the truth only")
     parser.add_argument("--results", type=Path, default=ROOT / "benchmarks/results/generator.json")
@@ -194,7 +196,8 @@ def main() -> None:
         arguments.results.write_text(json.dumps(results, indent=1))
         arguments.results.with_suffix(".md").write_text("\n\n".join(tables) + "\n")
         if arguments.sheet is not None:
-            file = arguments.sheet.with_stem(f"{arguments.sheet.stem}-{name.split(',')[0]}")
+            short = name.split(",")[0].replace(" ", "-")
+            file = arguments.sheet.with_stem(f"{arguments.sheet.stem}-{short}")
             write_sheet(file, kept, compact=arguments.compact)
     print(f"results: {arguments.results}")
     if arguments.sheet is not None and arguments.photos is not None:

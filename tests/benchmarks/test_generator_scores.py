@@ -27,7 +27,6 @@ from benchmarks.generator_report import (
 )
 from benchmarks.generator_scores import HIGHEST_PSNR_DB, angle_deg, score_views, turning
 from benchmarks.generator_views import Views
-from svim3d.metrics import structural_similarity
 
 EMPTY = {"roughness": 0.5, "metallic": 0.25}
 
@@ -73,23 +72,6 @@ def test_iou_of_half_a_mask(case):
     mask[..., 24:, :] = 0.0  # the ball is in the middle of the 48 columns
     iou = score_views(replace(case.truth, mask=mask), case.truth, EMPTY)["mask_iou"]
     torch.testing.assert_close(iou, torch.full((21,), 0.5))
-
-
-def test_similarity_of_flat_pictures_is_the_closed_form():
-    a, b = 0.3, 0.7
-    found = structural_similarity(torch.full((1, 16, 16, 3), a), torch.full((1, 16, 16, 3), b))
-    expected = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
-    torch.testing.assert_close(found, torch.full((1, 16, 16, 1), expected), atol=1e-4, rtol=0.0)
-
-
-def test_similarity_of_a_negative_is_minus_one():
-    # About a mean of one half both pictures have the same means and opposite covariance; noise is
-    # large against the constants that keep flat pictures defined, but its window means are not
-    # exactly one half.
-    noise = torch.rand(1, 64, 64, 1, generator=torch.Generator().manual_seed(0), dtype=torch.double)
-    noise = (noise > 0.5).double()
-    similar = structural_similarity(noise, 1.0 - noise)
-    assert float(similar.mean()) == pytest.approx(-1.0, abs=0.08)
 
 
 @pytest.mark.parametrize("degrees", [0.01, 60.0, 180.0])
