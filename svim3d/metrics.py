@@ -1,7 +1,8 @@
 """Figures of merit of pictures and surfaces.
 
-Pictures: PSNR and mean angle inside a mask. Surfaces: exact distances from points to triangles (no
-sampling floor on the side measured against) and the overlap of enclosed volumes.
+Pictures: PSNR and mean angle inside a mask, structural similarity. Surfaces: exact distances from
+points to triangles (no sampling floor on the side measured against) and the overlap of enclosed
+volumes.
 """
 
 import math
@@ -13,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from svim3d.compiled import kernel
 from svim3d.numerics import dot, normalize
@@ -23,6 +25,10 @@ MAX_TREE_DEPTH = 64  # entries of the search stack: twice the depth of a tree ov
 # Sample points stand off the cell centres by this share of a cell, so that columns never run
 # along edges and faces of meshes that were cut from the same lattice.
 OFF_LATTICE = math.pi * 1e-4
+
+# Source: Wang et al. 2004, "Image Quality Assessment", section III.C.
+SSIM_RADIUS_PX, SSIM_SPREAD_PX = 5, 1.5
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 Vector = tuple[float, float, float]
 
@@ -56,6 +62,37 @@ def mean_angle_deg(
     blank = (a.square().sum(-1) < 0.5) | (b.square().sum(-1) < 0.5)
     angle = torch.where(blank, math.pi / 2, angle)
     return math.degrees(float(angle[mask[..., 0]].mean()))
+
+
+def structural_similarity(
+    image: Float[Tensor, "V H W C"], truth: Float[Tensor, "V H W C"]
+) -> Float[Tensor, "V H W 1"]:
+    """SSIM at every pixel, averaged over channels; display-encoded pictures, peak 1.
+
+    The Gaussian window has 11 pixels; beyond the border a picture goes on as its last row.
+
+    Source: Wang et al. 2004, eq. 13.
+    """
+    mean_a, mean_b = _gaussian_mean(image), _gaussian_mean(truth)
+    variance_a = _gaussian_mean(image.square()) - mean_a.square()
+    variance_b = _gaussian_mean(truth.square()) - mean_b.square()
+    covariance = _gaussian_mean(image * truth) - mean_a * mean_b
+    level = (2 * mean_a * mean_b + SSIM_C1) / (mean_a.square() + mean_b.square() + SSIM_C1)
+    structure = (2 * covariance + SSIM_C2) / (variance_a + variance_b + SSIM_C2)
+    return (level * structure).mean(-1, keepdim=True)
+
+
+def _gaussian_mean(pictures: Float[Tensor, "V H W C"]) -> Float[Tensor, "V H W C"]:
+    """Mean over SSIM's window, one axis after the other."""
+    offset = torch.arange(-SSIM_RADIUS_PX, SSIM_RADIUS_PX + 1).to(pictures)
+    window = (-0.5 * (offset / SSIM_SPREAD_PX) ** 2).exp()
+    window = window / window.sum()
+    planes = pictures.movedim(-1, 1).flatten(0, 1)[:, None]
+    padded = functional.pad(planes, [SSIM_RADIUS_PX] * 4, mode="replicate")
+    rows = functional.conv2d(padded, window.view(1, 1, -1, 1))
+    mean = functional.conv2d(rows, window.view(1, 1, 1, -1))
+    views, channels = len(pictures), pictures.shape[-1]
+    return mean.view(views, channels, *mean.shape[2:]).movedim(1, -1)
 
 
 def sample_surface(

@@ -10,6 +10,7 @@ from svim3d.metrics import (
     occupancy,
     psnr,
     sample_surface,
+    structural_similarity,
     volume_iou,
 )
 
@@ -57,6 +58,23 @@ def test_uncovered_pixels_count_as_a_right_angle():
     a, b = torch.eye(3), torch.eye(3)
     b[2] = 0
     assert mean_angle_deg(a, b, torch.ones(3, 1, dtype=torch.bool)) == pytest.approx(30.0)
+
+
+def test_similarity_of_flat_pictures_is_the_closed_form():
+    a, b = 0.3, 0.7
+    found = structural_similarity(torch.full((1, 16, 16, 3), a), torch.full((1, 16, 16, 3), b))
+    expected = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
+    torch.testing.assert_close(found, torch.full((1, 16, 16, 1), expected), atol=1e-4, rtol=0.0)
+
+
+def test_similarity_of_a_negative_is_minus_one():
+    # About a mean of one half both pictures have the same means and opposite covariance; noise is
+    # large against the constants that keep flat pictures defined, but its window means are not
+    # exactly one half.
+    noise = torch.rand(1, 64, 64, 1, generator=torch.Generator().manual_seed(0), dtype=torch.double)
+    noise = (noise > 0.5).double()
+    similar = structural_similarity(noise, 1.0 - noise)
+    assert float(similar.mean()) == pytest.approx(-1.0, abs=0.08)
 
 
 def test_samples_are_uniform_by_area():
