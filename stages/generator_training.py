@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from stages.base import Context
@@ -178,7 +179,7 @@ def draw_clips(
     def below(count: int) -> int:
         return int(torch.randint(count, (1,), generator=generator))
 
-    latents, references, pictures, cameras, good = [], [], [], [], []
+    latents, references, tokens, cameras, good = [], [], [], [], []
     for _ in range(config.batch):
         clip = clips[below(len(clips))]
         light = below(len(clip.rgb))
@@ -189,22 +190,35 @@ def draw_clips(
         groups = torch.cat([clip.rgb[light][None], clip.materials[form]])[:, order].float()
         latents.append(groups.transpose(0, 1).flatten(1, 2) * model.spec.latent_scale)
         references.append(groups[0, -1])
-        pictures.append(clip.pictures[light, order[-1]])
+        tokens.append(_token(clip, light, int(order[-1]), model, config, ctx))
         elevation, azimuth = clip.elevation_deg[form][order], clip.azimuth_deg[form][order]
         cameras.append(camera_numbers(elevation, azimuth, model.spec.cond_aug))
         good.append(clip.has_good_materials)
-    shown = torch.stack(pictures).to(ctx.device).float() / 127.5 - 1.0
-    with _autocast(config, ctx):
-        token = embed_picture(model.image_encoder, shown).float()
     return Clips(
         latents=torch.stack(latents).to(ctx.device),
         conditioning=Conditioning(
-            token=token,
+            token=torch.cat(tokens),
             latent=torch.stack(references).to(ctx.device),
             camera=torch.stack(cameras).to(ctx.device),
         ),
         has_good_materials=torch.tensor(good, device=ctx.device),
     )
+
+
+def _token(
+    clip: StoredClip,
+    light: int,
+    frame: int,
+    model: MaterialDiffusion,
+    config: GeneratorTrainingConfig,
+    ctx: Context,
+) -> Float[Tensor, "1 1 d"]:
+    """The embedding of a frame: as stored, unless the image encoder learns."""
+    if clip.tokens is not None and not config.trains_image_encoder:
+        return clip.tokens[light, frame].float().to(ctx.device)[None, None]
+    shown = clip.pictures[light, frame][None].to(ctx.device).float() / 127.5 - 1.0
+    with _autocast(config, ctx):
+        return embed_picture(model.image_encoder, shown).float()
 
 
 def _step(

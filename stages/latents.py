@@ -18,6 +18,7 @@ from stages.settings.training import LatentsConfig
 from svim3d.diffusion import clips
 from svim3d.diffusion.autoencoder import encode
 from svim3d.diffusion.clips import StoredClip
+from svim3d.diffusion.conditioning import embed_picture
 from svim3d.diffusion.groups import as_network_input, over_background
 from svim3d.diffusion.model import MaterialDiffusion
 from svim3d.io.clip_file import write_clip
@@ -87,14 +88,16 @@ def _clip(
     rgb = torch.stack(
         [clips.mirrored_pictures(r) if f else r for r, f in zip(rgb, form.tolist(), strict=True)]
     )
+    pictures = _encoder_pictures(model, rgb)
     return StoredClip(
         rgb=_latents(model, rgb),
         materials=_latents(model, torch.stack([plain, mirrored][:forms])),
         form=form.long(),
-        pictures=_encoder_pictures(model, rgb),
+        pictures=pictures,
         elevation_deg=torch.stack(elevations[:forms]),
         azimuth_deg=torch.stack(azimuths[:forms]),
         has_good_materials=example.metadata.get("quality") == GOOD,
+        tokens=_tokens(model, pictures) if config.embedded else None,
     )
 
 
@@ -129,3 +132,12 @@ def _encoder_pictures(
         flat, size=(side, side), mode="bicubic", align_corners=False, antialias=True
     )
     return small.round().clamp(0.0, 255.0).byte().unflatten(0, rgb.shape[:2])
+
+
+def _tokens(
+    model: MaterialDiffusion, pictures: UInt8[Tensor, "l k 3 t t"]
+) -> Float[Tensor, "l k d"]:
+    """What the image encoder makes of each frame, one light at a time."""
+    shown = (light.float() / 127.5 - 1.0 for light in pictures)
+    tokens = [embed_picture(model.image_encoder, light.to(model.device)) for light in shown]
+    return torch.stack(tokens)[:, :, 0].half().cpu()

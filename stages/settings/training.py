@@ -34,6 +34,9 @@ class LatentsConfig(StageConfig):
     """Share of clips over white; the others stand before a random colour."""
     mirrored: bool = True
     """Whether every other light sees the object mirrored, which doubles the shapes."""
+    embedded: bool = True
+    """Whether the reference views' tokens are computed as well; an image encoder that learns has no
+    use for them."""
 
 
 class GeneratorTrainingConfig(StageConfig):

@@ -25,6 +25,7 @@ class StoredClip:
         elevation_deg: of each frame, for each form.
         azimuth_deg: of each frame, for each form; the last is the reference view's, 0.
         has_good_materials: whether materials can be learnt from.
+        tokens: each frame's embedding, where the image encoder does not learn.
     """
 
     rgb: Float[Tensor, "l k z h w"]
@@ -34,6 +35,7 @@ class StoredClip:
     elevation_deg: Float[Tensor, "m k"]
     azimuth_deg: Float[Tensor, "m k"]
     has_good_materials: bool
+    tokens: Float[Tensor, "l k d"] | None = None
 
     def frames_seen_from(self, reference: int) -> Int[Tensor, "k"]:
         """Order of the frames in which `reference` is the last and azimuths ascend."""

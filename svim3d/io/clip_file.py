@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from torch import Tensor
+
 from svim3d.diffusion.clips import StoredClip
 from svim3d.io.weights import load_metadata, load_tensors, save_tensors
 
@@ -10,7 +12,7 @@ GOOD_MATERIALS = "has_good_materials"  # key of the metadata
 
 def write_clip(path: Path, clip: StoredClip) -> None:
     """Write a clip; a reader never sees half a file."""
-    tensors = {name: value for name, value in vars(clip).items() if name != GOOD_MATERIALS}
+    tensors = {name: value for name, value in vars(clip).items() if isinstance(value, Tensor)}
     temporary = path.with_suffix(".tmp")
     save_tensors(temporary, tensors, {GOOD_MATERIALS: str(int(clip.has_good_materials))})
     temporary.replace(path)

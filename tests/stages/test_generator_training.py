@@ -169,6 +169,32 @@ def test_a_batch_shows_one_frame_as_reference_everywhere(tmp_path):
     assert len(seen) > 5
 
 
+def test_stored_tokens_are_what_the_encoder_says(tmp_path):
+    """Precomputed embeddings train like embeddings made at each step."""
+    clip, model = stored_clip(0), tiny_model()
+    shown = clip.pictures.float() / 127.5 - 1.0
+    with torch.no_grad():
+        tokens = torch.stack([embed_picture(model.image_encoder, p)[:, 0] for p in shown])
+    ctx = Context("training generator", CPU, 0, tmp_path / "work", tmp_path / "shared")
+    config = settings(any_reference=True, batch=8)
+    made = draw_clips([clip], model, 0, config, ctx)
+    stored = draw_clips([replace(clip, tokens=tokens.half())], model, 0, config, ctx)
+    # Half precision keeps 11 bits.
+    torch.testing.assert_close(
+        stored.conditioning.token, made.conditioning.token, rtol=2**-11, atol=1e-6
+    )
+    learning = settings(any_reference=True, batch=8, trains_image_encoder=True)
+    wrong = replace(clip, tokens=torch.zeros_like(tokens).half())
+    seen = draw_clips([wrong], model, 0, learning, ctx).conditioning.token
+    torch.testing.assert_close(seen, made.conditioning.token)
+
+
+def test_recomputed_activations_change_nothing(tmp_path):
+    plain = weights(run(tmp_path / "plain", settings(), [stored_clip(0)]))
+    frugal = settings(gradient_checkpointing=True)
+    assert moved(plain, weights(run(tmp_path / "frugal", frugal, [stored_clip(0)]))) == set()
+
+
 def test_without_good_materials_phase_2_has_nothing_to_learn_from(tmp_path):
     with pytest.raises(InputError, match="0 of them with good materials"):
         run(tmp_path, settings(), [stored_clip(0, good=False)])
