@@ -95,8 +95,8 @@ def test_wishes_for_an_idle_stage_are_refused(store, option):
 
 def test_the_example_photo_is_shipped_with_its_background_cut_out():
     picture = read_png(commands.input_path("photo"))
-    assert picture.shape == (256, 256, 4)
-    assert float(picture[0, 0, 3]) == 0.0 and float(picture[128, 128, 3]) == 1.0
+    assert picture.shape == (448, 448, 4)
+    assert float(picture[0, 0, 3]) == 0.0 and float(picture[224, 224, 3]) == 1.0
 
 
 @pytest.mark.parametrize(
