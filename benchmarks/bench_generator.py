@@ -226,7 +226,8 @@ def choices(training: Training) -> dict:
     return {
         "objects": training.objects,
         "tone": asdict(training.tone),
-        "ellipsoid": asdict(training.warp),
+        "ellipsoid's colours": asdict(training.warp),
+        "ellipsoid's mask and normals": asdict(training.shape),
         "repeated normals": "mean image" if training.repeats_mean_normals else "inflated mask",
         "mean value": training.mean_value,
         "best constant": training.constant,

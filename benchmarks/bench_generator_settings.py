@@ -22,6 +22,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.ticker import LogLocator, NullFormatter
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -144,6 +145,10 @@ def draw_chart(rows: dict[Setting, Row], own: Setting, file: Path) -> None:
                     fontsize=8,
                 )
         axis.set_xscale("log")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.margins(0.12)
         axis.set_xlabel("processor seconds per orbit (numbers: steps)")
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)

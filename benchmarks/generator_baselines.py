@@ -11,13 +11,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from benchmarks.generator_scores import angle_deg, decibels, masked_mean
+from benchmarks.generator_scores import EMPTY_ANGLE_DEG, angle_deg, decibels, masked_mean
 from benchmarks.generator_views import COVERED, Case, Views, over_white
 from benchmarks.generator_warp import Warp, fit_ellipsoid, inflated_normals, warp_views
 from svim3d.diffusion.groups import without_background
 from svim3d.numerics import normalize
-
-Baseline = Callable[[Case], Views]
 
 BINS = 21  # azimuths of the mean images
 CHOICE_OBJECTS = 16  # training objects on which variants compete
@@ -47,7 +45,8 @@ class Training:
         constant: roughness and metallic with the smallest mean error over views, where one value
             has to do: for metallic, mostly 0 or 1, that is not the mean.
         tone: from reference colours to basecolor.
-        warp: the variant of the ellipsoid that did best.
+        warp: the variant of the ellipsoid whose colours did best.
+        shape: the variant whose normals did best; it gives the mask too.
         repeats_mean_normals: whether the repeated view's normals are the mean image's rather than
             those of the inflated mask.
         objects: how many were seen.
@@ -58,6 +57,7 @@ class Training:
     constant: dict[str, float]
     tone: Tone
     warp: Warp
+    shape: Warp
     repeats_mean_normals: bool
     objects: int
 
@@ -156,6 +156,7 @@ def _without_choices(sums: _Sums, objects: int) -> Training:
         constant={name: best_constant(torch.stack(s)) for name, s in sums.spreads.items()},
         tone=_fit_tone(sums.tone),
         warp=Warp(SCALES[0], carves=False),
+        shape=Warp(SCALES[0], carves=False),
         repeats_mean_normals=False,
         objects=objects,
     )
@@ -185,28 +186,36 @@ def _fit_tone(sums: Tensor) -> Tone:
 def _choose(training: Training, cases: list[Case]) -> Training:
     """Take the variants that do best on training objects."""
 
-    def mean_of(score: Callable[[Views, Views], Tensor], baseline: Baseline) -> float:
-        scores = [score(baseline(case), case.truth)[:-1].mean() for case in cases]
-        return float(torch.stack(scores).mean())
+    def mean_of(score: Callable[[Views, Views], Tensor], found: list[Views]) -> float:
+        pairs = zip(found, cases, strict=True)
+        return float(torch.stack([score(v, c.truth)[:-1].mean() for v, c in pairs]).mean())
 
     def rgb_psnr(found: Views, truth: Views) -> Tensor:
         return decibels((found.rgb - truth.rgb).square().mean((1, 2, 3)))
 
     def normal_deg(found: Views, truth: Views) -> Tensor:
-        return masked_mean(angle_deg(found.normal, truth.normal), truth.mask > COVERED)
+        there = truth.mask > COVERED
+        angle = angle_deg(found.normal, truth.normal).where(
+            found.mask > COVERED, torch.tensor(EMPTY_ANGLE_DEG)
+        )
+        return masked_mean(angle, there)
 
     variants = [Warp(scale, carves) for scale in SCALES for carves in (False, True)]
-    psnr = {
-        warp: mean_of(rgb_psnr, lambda c, w=warp: warped(c, replace(training, warp=w)))
-        for warp in variants
-    }
-    training = replace(training, warp=max(psnr, key=lambda w: psnr[w]))
-    angle = {
-        choice: mean_of(
-            normal_deg, lambda c, r=choice: repeated(c, replace(training, repeats_mean_normals=r))
-        )
-        for choice in (False, True)
-    }
+    colours, shapes = {}, {}
+    for warp in variants:
+        tried = replace(training, warp=warp, shape=warp)
+        found = [warped(case, tried) for case in cases]
+        colours[warp] = mean_of(rgb_psnr, found)
+        shapes[warp] = mean_of(normal_deg, found)
+    training = replace(
+        training,
+        warp=max(colours, key=lambda w: colours[w]),
+        shape=min(shapes, key=lambda w: shapes[w]),
+    )
+    angle = {}
+    for choice in (False, True):
+        tried = replace(training, repeats_mean_normals=choice)
+        angle[choice] = mean_of(normal_deg, [repeated(case, tried) for case in cases])
     return replace(training, repeats_mean_normals=angle[True] < angle[False])
 
 
@@ -244,14 +253,17 @@ def warped(case: Case, training: Training) -> Views:
     body = fit_ellipsoid(case.mask, float(case.elevation_deg[-1]), case.fov_deg)
     straight = without_background(case.picture, case.mask, 1.0)
     colours = torch.cat([straight, training.tone(straight)], -1)
-    seen = warp_views(case, body.scaled(training.warp.scale), colours, carves=training.warp.carves)
-    rgb, basecolor = seen.colours.split(3, -1)
+    shown, shape = (
+        warp_views(case, body.scaled(warp.scale), colours, carves=warp.carves)
+        for warp in (training.warp, training.shape)
+    )
+    rgb, basecolor = shown.colours.split(3, -1)
     return Views(
-        rgb=over_white(rgb, seen.mask),
-        basecolor=over_white(basecolor, seen.mask),
-        normal=seen.normal,
-        mask=seen.mask,
-        **_constants(seen.mask, training.constant),
+        rgb=over_white(rgb, shown.mask),
+        basecolor=over_white(basecolor, shown.mask),
+        normal=shape.normal,
+        mask=shape.mask,
+        **_constants(shape.mask, training.constant),
     )
 
 
