@@ -37,6 +37,12 @@ def data_options() -> argparse.ArgumentParser:
     options.add_argument(
         "--workers", type=int, default=1, metavar="W", help="processes (%(default)s)"
     )
+    _add_backend(options)
+    return options
+
+
+def _add_backend(options: argparse.ArgumentParser) -> None:
+    """What renders RGB, and how Cycles is reached."""
     options.add_argument(
         "--backend",
         choices=("raster", "cycles"),
@@ -65,4 +71,3 @@ def data_options() -> argparse.ArgumentParser:
         metavar="S",
         help="seconds that one example may take (%(default).0f)",
     )
-    return options
