@@ -14,19 +14,35 @@ BOUNDS = {
     "views": (1, 512),
     "lights": (1, 64),
     "workers": (1, 256),
+    "cycles_samples": (1, 65_536),
+    "cycles_timeout": (1, 1_000_000),
 }
 
 
 def data(options: argparse.Namespace) -> int:
     """Render what is missing, tell of files that were left out, and what there is now."""
     for name, (least, most) in BOUNDS.items():
-        if not least <= getattr(options, name) <= most:
-            raise InputError(
-                f"--{name}: wanted {least} to {most}, got {getattr(options, name)}; choose another"
-            )
-    from stages.data_render import DataRequest, environment_files, mesh_files, render_data
+        given = getattr(options, name)
+        if not least <= given <= most:
+            option = "--" + name.replace("_", "-")
+            raise InputError(f"{option}: wanted {least} to {most}, got {given}; choose another")
+    from stages.data_render import (
+        DataRequest,
+        cycles_with,
+        environment_files,
+        mesh_files,
+        render_data,
+    )
     from stages.store import Store
 
+    cycles = None
+    if options.backend == "cycles":
+        cycles = cycles_with(
+            options.cycles_python,
+            samples=options.cycles_samples,
+            device=options.cycles_device,
+            timeout_s=options.cycles_timeout,
+        )
     request = DataRequest(
         folder=options.output,
         seed=options.seed,
@@ -36,6 +52,7 @@ def data(options: argparse.Namespace) -> int:
         meshes=mesh_files(options.meshes),
         environments=environment_files(options.environments),
         cache=Store(options.store).shared,
+        cycles=cycles,
     )
     console = Console()
     tally = {"made": 0, "kept": 0, "skipped": 0}

@@ -37,4 +37,37 @@ def data_options() -> argparse.ArgumentParser:
     options.add_argument(
         "--workers", type=int, default=1, metavar="W", help="processes (%(default)s)"
     )
+    _add_backend(options)
     return options
+
+
+def _add_backend(options: argparse.ArgumentParser) -> None:
+    """What renders RGB, and how Cycles is reached."""
+    options.add_argument(
+        "--backend",
+        choices=("raster", "cycles"),
+        default="raster",
+        help="what renders RGB: the built-in rasteriser, or Blender's path tracer (%(default)s)",
+    )
+    options.add_argument(
+        "--cycles-python",
+        type=Path,
+        metavar="PATH",
+        help="Python 3.11 of an environment with bpy 4.5, for --backend cycles",
+    )
+    options.add_argument(
+        "--cycles-samples", type=int, default=64, metavar="N", help="paths a pixel (%(default)s)"
+    )
+    options.add_argument(
+        "--cycles-device",
+        choices=("cpu", "gpu"),
+        default="cpu",
+        help="cpu: one thread for each worker (%(default)s)",
+    )
+    options.add_argument(
+        "--cycles-timeout",
+        type=float,
+        default=3600.0,
+        metavar="S",
+        help="seconds that one example may take (%(default).0f)",
+    )

@@ -2,17 +2,19 @@
 
 Reads meshes and environments where some are named; writes `NNNNNN.safetensors` and `dataset.json`.
 Example i of a seed is always the same, so a folder can grow, and a run that was stopped goes on
-where it was: whole files are kept, the rest is made.
+where it was: whole files are kept, the rest is made. RGB comes from our rasteriser or, with shadows
+and light from surface to surface as they are, from Cycles.
 """
 
 import functools
 import json
+import math
 import multiprocessing
 import os
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,20 +24,27 @@ from torch import Tensor
 
 from stages.errors import InputError
 from stages.prefilter_cache import cached_operator
+from svim3d.io.cycles import Cycles, render_with_cycles
 from svim3d.io.glb import read_mesh
 from svim3d.io.light import SUFFIXES as LIGHT_SUFFIXES
 from svim3d.io.light import read_light
 from svim3d.io.obj import read_obj
 from svim3d.io.training_data import example_file, is_whole, read_example_metadata, write_example
 from svim3d.mesh.source_mesh import SourceMesh, normalised
-from svim3d.synthesis.examples import FOV_DEG, render_example
+from svim3d.synthesis.examples import FOV_DEG, Renderer, Shot, render_example
 from svim3d.synthesis.lights import SIZE
+from svim3d.synthesis.scenes import micropolygons
+from svim3d.synthesis.views import with_coverage
 
 SUMMARY = "dataset.json"
 MESH_SUFFIXES = (".glb", ".gltf", ".obj")
 # One thread a process: the pictures are small, and as many processes as cores are wanted anyway.
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 EXAMPLES_PER_CALL = 4  # that a process is handed at a time: about a second of work
+EDGE_PX = 1.0  # of the triangles that carry materials to Cycles, about; see `micropolygons`
+# More than an example has pictures, whose seeds count up from its own.
+SEEDS_PER_EXAMPLE = 1 << 16
+RASTER = "raster"
 KEPT_MESHES = 4  # that a process holds: examples of one mesh are far apart
 
 Status = Literal["made", "kept", "skipped"]
@@ -54,6 +63,7 @@ class DataRequest:
         meshes: files to show one after the other, over and over; none invents objects.
         environments: files that every other light is taken from; none invents all lights.
         cache: folder of derived data that runs share.
+        cycles: what makes the RGB pictures; None is our rasteriser.
     """
 
     folder: Path
@@ -64,6 +74,12 @@ class DataRequest:
     meshes: tuple[Path, ...]
     environments: tuple[Path, ...]
     cache: Path
+    cycles: Cycles | None = None
+
+    @property
+    def backend(self) -> str:
+        """What makes the RGB pictures, and how well."""
+        return RASTER if self.cycles is None else f"cycles, {self.cycles.samples} samples"
 
     def settings(self) -> dict[str, Any]:
         """What all examples of a folder have in common."""
@@ -75,6 +91,7 @@ class DataRequest:
             "fov_deg": FOV_DEG,
             "meshes": [file.name for file in self.meshes],
             "environments": [file.name for file in self.environments],
+            "backend": self.backend,
         }
 
 
@@ -117,6 +134,22 @@ def mesh_files(folder: Path | None) -> tuple[Path, ...]:
 def environment_files(folder: Path | None) -> tuple[Path, ...]:
     """Environments in a folder and below; see `files_in`."""
     return files_in(folder, LIGHT_SUFFIXES, "environments")
+
+
+def cycles_with(
+    python: Path | None, *, samples: int, device: Literal["cpu", "gpu"], timeout_s: float
+) -> Cycles:
+    """Cycles, run by an interpreter; see `Cycles`.
+
+    Raises:
+        InputError: no interpreter is named.
+    """
+    if python is None:
+        raise InputError(
+            "--backend cycles wants a Python that has Blender's package: python3.11 -m venv DIR, "
+            "DIR/bin/pip install bpy==4.5.*, then --cycles-python DIR/bin/python"
+        )
+    return Cycles(python, samples, device, timeout_s)
 
 
 def render_data(request: DataRequest, objects: int, workers: int) -> Iterator[Outcome]:
@@ -189,9 +222,31 @@ def _make(request: DataRequest, index: int, file: Path) -> Outcome:
         lights=request.lights,
         mesh=mesh,
         maps=_maps(request.environments),
+        renderer=_renderer(request, index),
     )
-    write_example(file, example)
+    metadata = {**example.metadata, "backend": request.backend}
+    write_example(file, replace(example, metadata=metadata))
     return Outcome(index, "made")
+
+
+def _renderer(request: DataRequest, index: int) -> Renderer | None:
+    """Cycles, if it is wanted, with random numbers of the example's own."""
+    cycles = request.cycles
+    if cycles is None:
+        return None
+    seed = (request.seed * 1_000_003 + index) * SEEDS_PER_EXAMPLE
+
+    def path_traced(shot: Shot) -> list[Tensor]:
+        height = 2.0 * math.tan(math.radians(shot.cameras.fov_y_deg) / 2.0)
+        pixel = height * float(shot.cameras.positions[0].norm()) / shot.cameras.height
+        mesh = micropolygons(shot.scene, EDGE_PX * pixel)
+        try:
+            pictures = render_with_cycles(cycles, mesh, shot.cameras, shot.lights, seed=seed)
+        except ValueError as error:
+            raise InputError(str(error)) from error
+        return [with_coverage(picture, shot.samples.mask) for picture in pictures]
+
+    return path_traced
 
 
 @functools.lru_cache(maxsize=KEPT_MESHES)
@@ -216,7 +271,8 @@ def _claim(request: DataRequest) -> None:
     try:
         request.folder.mkdir(parents=True, exist_ok=True)
         if file.is_file():
-            there = json.loads(file.read_text())
+            # Folders that name no backend are from when there was one.
+            there = {"backend": RASTER, **json.loads(file.read_text())}
             other = {k: there.get(k) for k, v in request.settings().items() if there.get(k) != v}
             if other:
                 raise InputError(

@@ -73,6 +73,9 @@ DOORS = {
     "PIL": ("svim3d.io.image", "svim3d.io.photo"),
     "onnxruntime": ("svim3d.io.matting_network",),
     "imageio_ffmpeg": ("svim3d.io.animation",),
+    # A script for an interpreter of its own: nothing imports it.
+    "bpy": ("svim3d.io.cycles_scene",),
+    "mathutils": ("svim3d.io.cycles_scene",),
     "trimesh": ("svim3d.io.glb", "svim3d.io.obj"),
     "xatlas": ("svim3d.mesh.xatlas_process",),
     "mitsuba": ("svim3d.render.path_tracing",),

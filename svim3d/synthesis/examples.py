@@ -1,7 +1,8 @@
 """Training examples from nothing but a seed and a number: object, cameras, lights, pictures."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -30,6 +31,34 @@ FOV_DEG = 33.8  # Source: SV3D
 DISPLAY_RANGE = (0.5, 0.9)  # display value that the bright part of the object gets
 
 
+@dataclass(frozen=True)
+class Shot:
+    """What a renderer is asked for: all views of a scene in all its lights.
+
+    Attributes:
+        scene: what is seen.
+        cameras: where from.
+        samples: what they see of it, as our rasteriser has it.
+        lights: octahedral radiance maps.
+    """
+
+    scene: Scene
+    cameras: Cameras
+    samples: ViewSamples
+    lights: Sequence[Float[Tensor, "n n 3"]]
+
+
+# Linear radiance of all views [V, H, W, 3] in each light, premultiplied by the samples' mask.
+Renderer = Callable[[Shot], Sequence[Tensor]]
+
+
+def rasterised(shot: Shot, operator: PyramidOperator) -> list[Float[Tensor, "V H W 3"]]:
+    """Our own renderer: split-sum shading with soft shadows; the operator prefilters the lights."""
+    pyramids = [operator(radiance) for radiance in shot.lights]
+    shadows = DepthPictures.of(shot.scene.geometry)
+    return [shot.samples.image(r) for r in shadowed_radiance(shot.samples, shadows, pyramids)]
+
+
 def cameras_for(scene: Scene, trajectory: Trajectory, size: int) -> tuple[Cameras, float]:
     """The trajectory's cameras at the distance that the object needs, and that distance."""
     near = orbit_cameras(trajectory.angles, radius=1.0, fov_y_deg=FOV_DEG, size=size)
@@ -47,6 +76,7 @@ def photograph(
     *,
     size: int,
     seed: str,
+    renderer: Renderer | None = None,
 ) -> TrainingExample:
     """All pictures of a scene.
 
@@ -59,17 +89,16 @@ def photograph(
         operator: prefilters the lights.
         size: side of the pictures, pixels.
         seed: noted in the metadata.
+        renderer: of the RGB pictures; None is `rasterised`. All other pictures are always our
+            rasteriser's: they show the same surface, and without noise.
     """
     cameras, radius = cameras_for(scene, trajectory, size)
     samples = sample_views(scene.geometry, scene.materials, cameras)
     mask = samples.mask
     pictures = []
-    pyramids = [operator(radiance) for _, radiance in lights]
-    shadows = DepthPictures.of(scene.geometry)
-    for radiance, display in zip(
-        shadowed_radiance(samples, shadows, pyramids), displays, strict=True
-    ):
-        picture = samples.image(radiance)
+    shot = Shot(scene, cameras, samples, [radiance for _, radiance in lights])
+    rendered = rasterised(shot, operator) if renderer is None else renderer(shot)
+    for picture, display in zip(rendered, displays, strict=True):
         picture = picture * exposure_for(picture, mask, display)
         pictures.append(on_background(picture, mask, background=1.0, srgb=True))
     elevation, azimuth = (torch.tensor(a) for a in zip(*trajectory.angles, strict=True))
@@ -113,6 +142,7 @@ def render_example(
     lights: int,
     mesh: tuple[str, SourceMesh] | None = None,
     maps: Sequence[tuple[str, Float[Tensor, "n n 3"]]] = (),
+    renderer: Renderer | None = None,
 ) -> TrainingExample:
     """Example `index` of the data set of a seed: a pure function of its arguments.
 
@@ -126,6 +156,7 @@ def render_example(
         mesh: name and normalised mesh to show; None invents an object.
         maps: names and octahedral maps of the operator's size, from which every other light is
             taken, turned at random; none invents all lights.
+        renderer: see `photograph`.
     """
     dice = Dice.of(seed, index)
     if mesh is None:
@@ -144,6 +175,7 @@ def render_example(
         operator,
         size=size,
         seed=f"{seed}:{index}",
+        renderer=renderer,
     )
 
 

@@ -5,7 +5,9 @@ from dataclasses import dataclass, replace
 import torch
 
 from svim3d.fields.material_field import Materials
+from svim3d.mesh.micropolygons import Micropolygons, cut_long_edges
 from svim3d.mesh.source_mesh import SourceMaterial, SourceMesh
+from svim3d.numerics import normalize
 from svim3d.render.deferred import Geometry, MaterialSource, SurfacePoints
 from svim3d.render.pictures import MeshMaterials, mesh_geometry
 from svim3d.synthesis.bodies import turned
@@ -56,6 +58,33 @@ def scene_of_mesh(name: str, mesh: SourceMesh, yaw_deg: float) -> Scene:
         mesh, vertices=mesh.vertices @ yaw.T, normals=mesh.normals @ yaw.T, tangents=tangents
     )
     return Scene(name, mesh_geometry(mesh), MeshMaterials.of(mesh), mesh_quality(mesh))
+
+
+def micropolygons(scene: Scene, longest: float) -> Micropolygons:
+    """The scene with its materials asked for at the corners of triangles of edges so short.
+
+    Normal maps become shading normals of the corners.
+    """
+    geometry = scene.geometry
+    values = torch.cat([geometry.vertices, geometry.normals, geometry.attributes], 1)
+    corners, face = cut_long_edges(values[geometry.faces.long()], longest)
+    flat = corners.flatten(0, 1)
+    points = SurfacePoints(
+        position=flat[:, :3],
+        normal=normalize(flat[:, 3:6]),
+        facing=torch.ones_like(flat[:, :1]),
+        face=face.repeat_interleave(3),
+        attributes=flat[:, 6:],
+    )
+    materials = scene.materials(points)
+    at_corners = (
+        points.position,
+        normalize(points.normal + materials.bump),
+        materials.basecolor,
+        materials.roughness,
+        materials.metallic,
+    )
+    return Micropolygons(*(values.unflatten(0, (-1, 3)) for values in at_corners))
 
 
 def mesh_quality(mesh: SourceMesh) -> Quality:

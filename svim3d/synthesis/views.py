@@ -142,6 +142,17 @@ def on_background(
     return (blended.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
 
 
+def with_coverage(
+    rendered: Float[Tensor, "V H W 4"], mask: Float[Tensor, "V H W 1"]
+) -> Float[Tensor, "V H W 3"]:
+    """The colours of another renderer, premultiplied by our coverage instead of its own.
+
+    Both sample a pixel at other points, so that their coverages differ a little on silhouettes.
+    """
+    coverage = rendered[..., 3:]
+    return rendered[..., :3] / coverage.clamp_min(MIN_COVERAGE) * mask
+
+
 def camera_normals(samples: ViewSamples, cameras: Cameras) -> UInt8[Tensor, "V H W 3"]:
     """Unit camera-space normals, encoded (n + 1) / 2, black where nothing is."""
     mean = normalize(samples.image(samples.normal))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from fake_cycles import fake_interpreter
 
 from stages.data_render import (
     SUMMARY,
@@ -15,6 +16,7 @@ from stages.data_render import (
     render_data,
 )
 from stages.errors import InputError
+from svim3d.io.cycles import Cycles
 from svim3d.io.exr import write_rgb
 from svim3d.io.training_data import read_example
 
@@ -92,6 +94,40 @@ def test_empty_and_missing_folders_are_refused(tmp_path):
         mesh_files(tmp_path / "nowhere")
     with pytest.raises(InputError, match="wanted environments"):
         environment_files(tmp_path)
+
+
+def test_cycles_replaces_the_rgb_pictures_and_nothing_else(request_of, tmp_path):
+    statuses(request_of, 1)
+    cycles = Cycles(fake_interpreter(tmp_path), 7, "cpu", 60.0)
+    traced = replace(request_of, folder=tmp_path / "traced", cycles=cycles)
+    assert statuses(traced, 1) == ["made"]
+    ours = read_example(request_of.folder / "000000.safetensors")
+    theirs = read_example(traced.folder / "000000.safetensors")
+    assert (ours.metadata["backend"], theirs.metadata["backend"]) == ("raster", "cycles, 7 samples")
+    for name in ("basecolor", "orm", "normal", "mask", "elevation_deg", "azimuth_deg"):
+        assert torch.equal(getattr(ours, name), getattr(theirs, name))
+    # All pictures of the player are even, the last view the brightest: 1 + light + 20. More than
+    # a tenth of all pixels on the object are its, so exposure gives them the display value.
+    whole = theirs.mask[..., 0] == 255
+    for light in range(2):
+        values = [theirs.rgb[light, view][whole[view]].unique() for view in range(3)]
+        assert all(len(v) == 1 for v in values)
+        assert int(values[0]) < int(values[1]) < int(values[2])
+        assert 0.5 * 255 - 1 <= int(values[2]) <= 0.9 * 255 + 1
+
+
+def test_a_folder_has_one_backend(request_of, tmp_path):
+    statuses(request_of, 1)
+    file = request_of.folder / SUMMARY
+    told = json.loads(file.read_text())
+    del told["backend"]  # as a folder has it that was begun before there were two
+    file.write_text(json.dumps(told))
+    assert statuses(request_of, 1) == ["kept"]
+    cycles = Cycles(tmp_path / "nowhere", 7, "cpu", 60.0)
+    with pytest.raises(InputError, match="other settings"):
+        statuses(replace(request_of, cycles=cycles), 1)
+    with pytest.raises(InputError, match="cannot be started"):
+        statuses(replace(request_of, folder=tmp_path / "other", cycles=cycles), 1)
 
 
 @pytest.mark.slow
