@@ -52,7 +52,8 @@ class Request:
     @property
     def run_folder(self) -> Path:
         """Where the results go."""
-        return self.out or OUTPUT_ROOT / self.path.resolve().stem
+        name = self.source if self.source in SHIPPED else self.path.resolve().stem
+        return self.out or OUTPUT_ROOT / name
 
     def plan(self, store: Store) -> Plan:
         """Resolve settings and look every stage up in the store."""

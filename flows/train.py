@@ -31,7 +31,7 @@ def train(options: argparse.Namespace) -> int:
     from stages.autoencoder_training import train_autoencoder
     from stages.execution import choose_device
     from stages.generator_training import train_generator
-    from stages.latents import precompute_latents
+    from stages.latents import precompute_latents, read_fitting
     from stages.training_folder import TrainingFolder, examples_of, load_model_spec
     from stages.training_sheet import draw_autoencoder_sheet, draw_generator_sheet
 
@@ -41,7 +41,9 @@ def train(options: argparse.Namespace) -> int:
     folder = TrainingFolder(
         options.output, options.seed, choose_device(options.device), _Teller(console)
     )
-    folder.require_same(config, spec, options.data)
+    folder.require_same(config, spec, examples[0])
+    read_fitting(examples[0], spec)
+    from_scratch = not options.model.is_dir()
     interrupt_on_stop()
     every_s = config.generator.checkpoint_every_s
     model = folder.start_model(spec, options.model)
@@ -53,13 +55,21 @@ def train(options: argparse.Namespace) -> int:
         folder.keep_model(model.with_latent_scale(scale))
         model = folder.reread_model()
     with folder.context("latents", every_s) as ctx:
-        clips = precompute_latents(model, examples, folder.root / "latents", config.latents, ctx)
+        clips = precompute_latents(
+            model,
+            examples,
+            folder.root / "latents",
+            config.latents,
+            ctx,
+            embedded=not from_scratch,
+        )
     with folder.context("generator", every_s) as ctx:
-        train_generator(
+        steps = train_generator(
             model,
             clips,
             config.generator,
             ctx,
+            from_scratch=from_scratch,
             on_checkpoint=lambda steps: folder.keep_model(model, steps=steps),
             on_sheet=lambda steps: draw_generator_sheet(
                 model,
@@ -69,6 +79,8 @@ def train(options: argparse.Namespace) -> int:
             ),
             stop_after_s=None if options.minutes is None else 60.0 * options.minutes,
         )
+    # Also after a kill between the last checkpoint and the model that belongs to it.
+    folder.keep_model(model, steps)
     console.print(f"{folder.model_folder}: a model for svim3d run --model", highlight=False)
     return DONE
 

@@ -30,7 +30,10 @@ def train_options() -> argparse.ArgumentParser:
         help="change one setting, like generator.batch=4; may be repeated",
     )
     options.add_argument(
-        "--minutes", type=float, metavar="N", help="stop after so long; the same command goes on"
+        "--minutes",
+        type=float,
+        metavar="N",
+        help="stop the generator after so long; the same command goes on",
     )
     options.add_argument("--seed", type=int, default=0, help="(%(default)s)")
     options.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")

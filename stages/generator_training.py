@@ -49,9 +49,11 @@ class _Fit:
     average: MovingAverage
 
     @classmethod
-    def start(cls, model: MaterialDiffusion, config: GeneratorTrainingConfig) -> "_Fit":
+    def start(
+        cls, model: MaterialDiffusion, config: GeneratorTrainingConfig, from_scratch: bool
+    ) -> "_Fit":
         parts = {"unet": model.unet}
-        if config.trains_image_encoder:
+        if from_scratch:
             parts["image_encoder"] = model.image_encoder
         named = {f"{p}.{n}": v for p, net in parts.items() for n, v in net.named_parameters()}
         adam = NamedAdam(named, {name: Rate(config.rate_1, ADAM_EPS) for name in named})
@@ -92,6 +94,7 @@ def train_generator(
     config: GeneratorTrainingConfig,
     ctx: Context,
     *,
+    from_scratch: bool,
     on_checkpoint: Callable[[int], None],
     on_sheet: Callable[[int], None],
     stop_after_s: float | None = None,
@@ -103,6 +106,8 @@ def train_generator(
         clip_files: as `precompute_latents` leaves them.
         config: settings.
         ctx: gives checkpoints and random numbers.
+        from_scratch: the model began with random weights: frames shall not meet at first, and the
+            image encoder learns with the UNet in phase 1.
         on_checkpoint: called with the steps done whenever a checkpoint was written, while the model
             holds the moving averages.
         on_sheet: the same, less often.
@@ -121,13 +126,13 @@ def train_generator(
         model.unet.enable_gradient_checkpointing()
     for part in model.parts.values():
         part.requires_grad_(False)
-    fit = _Fit.start(model, config)
+    fit = _Fit.start(model, config, from_scratch)
     saved = ctx.checkpoints.load()
     first = 0
     if saved is not None:
         first, tensors = saved
         fit.load_state(tensors)
-    elif config.from_scratch:
+    elif from_scratch:
         separate_frames(model.unet)
         fit.average = MovingAverage(fit.named.items(), config.decay)
     total = config.phase_1_steps + config.phase_2_steps
@@ -135,7 +140,7 @@ def train_generator(
     done = first
     for step in range(first, total):
         phase = 1 if step < config.phase_1_steps else 2
-        _set_free(model, phase, config)
+        _set_free(model, phase, from_scratch)
         batch = draw_clips(clips if phase == 1 else good, model, step, config, ctx)
         _step(fit, batch, step, phase, config, ctx)
         done = step + 1
@@ -157,13 +162,13 @@ def _is_over(started_s: float, stop_after_s: float | None) -> bool:
     return stop_after_s is not None and time.monotonic() - started_s > stop_after_s
 
 
-def _set_free(model: MaterialDiffusion, phase: int, config: GeneratorTrainingConfig) -> None:
+def _set_free(model: MaterialDiffusion, phase: int, from_scratch: bool) -> None:
     """What learns in a phase."""
     model.unet.requires_grad_(True)
     if phase == 1:
         for parameter in model.unet.temporal_attention():
             parameter.requires_grad_(False)
-    model.image_encoder.requires_grad_(config.trains_image_encoder and phase == 1)
+    model.image_encoder.requires_grad_(from_scratch and phase == 1)
 
 
 def draw_clips(
@@ -214,7 +219,7 @@ def _token(
     ctx: Context,
 ) -> Float[Tensor, "1 1 d"]:
     """The embedding of a frame: as stored, unless the image encoder learns."""
-    if clip.tokens is not None and not config.trains_image_encoder:
+    if clip.tokens is not None:
         return clip.tokens[light, frame].float().to(ctx.device)[None, None]
     shown = clip.pictures[light, frame][None].to(ctx.device).float() / 127.5 - 1.0
     with _autocast(config, ctx):

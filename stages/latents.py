@@ -10,7 +10,6 @@ from pathlib import Path
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from stages.base import Context
 from stages.errors import InputError
@@ -18,9 +17,9 @@ from stages.settings.training import LatentsConfig
 from svim3d.diffusion import clips
 from svim3d.diffusion.autoencoder import encode
 from svim3d.diffusion.clips import StoredClip
-from svim3d.diffusion.conditioning import embed_picture
+from svim3d.diffusion.conditioning import embed_picture, shrink_picture
 from svim3d.diffusion.groups import as_network_input, over_background
-from svim3d.diffusion.model import MaterialDiffusion
+from svim3d.diffusion.model import MaterialDiffusion, ModelSpec
 from svim3d.io.clip_file import write_clip
 from svim3d.io.training_data import read_example
 from svim3d.synthesis.example import TrainingExample
@@ -34,8 +33,19 @@ def precompute_latents(
     folder: Path,
     config: LatentsConfig,
     ctx: Context,
+    *,
+    embedded: bool,
 ) -> list[Path]:
     """A clip file for each example; those that are there already stay.
+
+    Args:
+        model: whose autoencoder and image encoder are used.
+        examples: files.
+        folder: of the clips.
+        config: settings.
+        ctx: gives random numbers.
+        embedded: compute the reference views' tokens as well; an image encoder that learns has no
+            use for them.
 
     Raises:
         InputError: examples of another size or another number of views than the model's.
@@ -44,22 +54,30 @@ def precompute_latents(
     files = [folder / file.name for file in examples]
     missing = [(e, f) for e, f in zip(examples, files, strict=True) if not f.exists()]
     for done, (source, file) in enumerate(missing):
-        example = read_example(source)
-        _check(example, source, model)
-        write_clip(file, _clip(model, example, source.stem, config, ctx))
+        example = read_fitting(source, model.spec)
+        write_clip(file, _clip(model, example, source.stem, config, ctx, embedded))
         ctx.report(done + 1, len(missing), {})
     return files
 
 
-def _check(example: TrainingExample, source: Path, model: MaterialDiffusion) -> None:
+def read_fitting(source: Path, spec: ModelSpec) -> TrainingExample:
+    """An example whose pictures are like the model's.
+
+    Raises:
+        InputError: no example, or another size or another number of views.
+    """
+    try:
+        example = read_example(source)
+    except ValueError as error:
+        raise InputError(str(error)) from error
     _, views, height, width, _ = example.rgb.shape
-    spec = model.spec
     if (views, height, width) != (spec.views, spec.image_size, spec.image_size):
         raise InputError(
             f"wanted {spec.views} views of {spec.image_size} x {spec.image_size} for "
             f"{spec.name}, {source} has {views} of {width} x {height}; render them with "
             f"svim3d data render --views {spec.views} --size {spec.image_size}"
         )
+    return example
 
 
 @torch.no_grad()
@@ -69,6 +87,7 @@ def _clip(
     name: str,
     config: LatentsConfig,
     ctx: Context,
+    embedded: bool,
 ) -> StoredClip:
     generator = ctx.generator(f"backgrounds {name}")
     lights = len(example.rgb)
@@ -97,7 +116,7 @@ def _clip(
         elevation_deg=torch.stack(elevations[:forms]),
         azimuth_deg=torch.stack(azimuths[:forms]),
         has_good_materials=example.metadata.get("quality") == GOOD,
-        tokens=_tokens(model, pictures) if config.embedded else None,
+        tokens=_tokens(model, pictures) if embedded else None,
     )
 
 
@@ -127,10 +146,8 @@ def _encoder_pictures(
 ) -> UInt8[Tensor, "l k 3 t t"]:
     """Frames at the image encoder's size."""
     side = model.spec.image_encoder["image_size"]
-    flat = rgb.flatten(0, 1).permute(0, 3, 1, 2).float()
-    small = interpolate(
-        flat, size=(side, side), mode="bicubic", align_corners=False, antialias=True
-    )
+    flat = as_network_input(rgb.flatten(0, 1).float() / 255.0)
+    small = (shrink_picture(flat, side, model.spec.shrink) + 1.0) * 127.5
     return small.round().clamp(0.0, 255.0).byte().unflatten(0, rgb.shape[:2])
 
 

@@ -51,8 +51,8 @@ def views_of_photo(
         )
     if config.keep_photo:
         best = _with_photo(best, photo)
-    cameras = place_cameras(best, angles, model.spec.fov_deg)
     try:
+        cameras = place_cameras(best, angles, model.spec.fov_deg)
         cameras, images, reference = admit_views(
             cameras, _images(best, cameras, confidence), len(cameras) - 1, ctx.event
         )

@@ -7,7 +7,9 @@ generator/         checkpoint and losses; sheet-<steps>.png
 model/             a complete model folder, of the last checkpoint
 """
 
+import hashlib
 import json
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,13 +20,20 @@ import torch
 from stages.base import Context, Progress
 from stages.errors import InputError
 from stages.settings.training import TrainingConfig
+from svim3d.diffusion.groups import GROUPS
 from svim3d.diffusion.model import MaterialDiffusion, ModelSpec
-from svim3d.io.model_folder import DESCRIPTION, read_model, read_spec, write_model
+from svim3d.io.model_folder import CARD, DESCRIPTION, read_model, read_spec, write_model
 
-SETTINGS, MODEL = "settings.json", "model"
+SETTINGS, MODEL, ORIGIN, NOTICE = "settings.json", "model", "origin.md", "NOTICE"
 EXAMPLES = "*.safetensors"
-# Settings that may change when a run goes on: they say how long, not how.
-FREE = {("generator", "phase_1_steps"), ("generator", "phase_2_steps"), ("autoencoder", "steps")}
+# Settings that may change when a run goes on: they say how long and how often, not how.
+FREE = {
+    ("generator", "phase_1_steps"),
+    ("generator", "phase_2_steps"),
+    ("generator", "checkpoint_every_s"),
+    ("generator", "sheet_every_s"),
+    ("autoencoder", "steps"),
+}
 
 
 class TrainingFolder:
@@ -66,25 +75,31 @@ class TrainingFolder:
             checkpoint_every_s=checkpoint_every_s,
         )
 
-    def require_same(self, config: TrainingConfig, spec: ModelSpec, data: Path) -> None:
+    def require_same(self, config: TrainingConfig, spec: ModelSpec, first_example: Path) -> None:
         """Hold a run to what it was begun with; write that down at the beginning.
 
         Raises:
-            InputError: something else than the number of steps has changed.
+            InputError: something else than the number of steps or of examples has changed.
         """
         file = self.root / SETTINGS
-        now = json.loads(
-            json.dumps({"config": config.model_dump(), "model": asdict(spec), "seed": self.seed})
-        )
+        about = {
+            "config": config.model_dump(),
+            "model": asdict(spec),
+            "seed": self.seed,
+            "first_example": hashlib.sha256(first_example.read_bytes()).hexdigest(),
+        }
+        now = json.loads(json.dumps(about))
         begun = json.loads(file.read_text()) if file.exists() else now
-        begun.pop("data", None)
         if changed := sorted(_changes(begun, now)):
             raise InputError(
                 f"{self.root} was begun with other settings ({', '.join(changed[:5])}); "
                 "use the old ones, or train in another folder"
             )
-        self.root.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(now | {"data": data.name}, indent=1) + "\n")
+        if not file.exists():
+            self.root.mkdir(parents=True, exist_ok=True)
+            temporary = file.with_suffix(".tmp")
+            temporary.write_text(json.dumps(now, indent=1) + "\n")
+            temporary.replace(file)
 
     @property
     def has_autoencoder(self) -> bool:
@@ -96,6 +111,7 @@ class TrainingFolder:
         if self.has_autoencoder:
             return self.reread_model()
         if source.is_dir():
+            self._keep_origin(source)
             self.keep_model(read_model(source, self.device))
             return self.reread_model()
         with torch.random.fork_rng(devices=[]):
@@ -115,7 +131,19 @@ class TrainingFolder:
             f"# {model.spec.name}\n\nA checkpoint of a training run after {steps} steps of the "
             "generator. Nobody has judged it yet.\n"
         )
+        origin = self.root / ORIGIN
+        if origin.exists():
+            card += (
+                f"\nTrained on from this model, whose terms it inherits:\n\n{origin.read_text()}"
+            )
         write_model(self.model_folder, model, card)
+
+    def _keep_origin(self, source: Path) -> None:
+        """The card and the notice of the model that training goes on from."""
+        self.model_folder.mkdir(parents=True, exist_ok=True)
+        for name, target in ((CARD, self.root / ORIGIN), (NOTICE, self.model_folder / NOTICE)):
+            if (source / name).is_file():
+                shutil.copyfile(source / name, target)
 
 
 def examples_of(data: Path) -> list[Path]:
@@ -140,9 +168,15 @@ def load_model_spec(file: Path) -> ModelSpec:
         InputError: it is neither.
     """
     try:
-        return read_spec(file if file.is_dir() else file.parent, file.name)
+        spec = read_spec(file) if file.is_dir() else read_spec(file.parent, file.name)
     except ValueError as error:
         raise InputError(str(error)) from error
+    if spec.groups != GROUPS:
+        raise InputError(
+            f"wanted a model of the groups {', '.join(GROUPS)}, {file} has "
+            f"{', '.join(spec.groups)}; convert it with --groups 4"
+        )
+    return spec
 
 
 def _changes(old: Mapping[str, Any], new: Mapping[str, Any], path: Sequence[str] = ()) -> list[str]:

@@ -34,9 +34,6 @@ class LatentsConfig(StageConfig):
     """Share of clips over white; the others stand before a random colour."""
     mirrored: bool = True
     """Whether every other light sees the object mirrored, which doubles the shapes."""
-    embedded: bool = True
-    """Whether the reference views' tokens are computed as well; an image encoder that learns has no
-    use for them."""
 
 
 class GeneratorTrainingConfig(StageConfig):
@@ -66,10 +63,6 @@ class GeneratorTrainingConfig(StageConfig):
     """Standard deviation of ln sigma."""
     drop_share: Share = 0.1
     """Share of clips that do not see the reference view."""
-    from_scratch: bool = False
-    """Whether temporal transformers start as identities; otherwise weights come from a model."""
-    trains_image_encoder: bool = False
-    """Whether the image encoder learns with the UNet in phase 1; otherwise it never changes."""
     any_reference: bool = False
     """Whether any frame of an evenly spaced orbit may stand as its reference view."""
     precision: Precision = "bfloat16"

@@ -82,18 +82,25 @@ def embed_picture(
         shrink: how it is brought to the encoder's size, as in training: by torch's antialiased
             bicubic filter, or as SV3D does, see `blur_and_resize`.
     """
-    side = encoder.config.image_size
-    if shrink == "blur":
-        resized = blur_and_resize(picture.float(), side)
-    else:
-        resized = functional.interpolate(
-            picture.float(), size=(side, side), mode="bicubic", align_corners=False, antialias=True
-        )
+    resized = shrink_picture(picture.float(), encoder.config.image_size, shrink)
     mean = resized.new_tensor(CLIP_MEAN).view(1, 3, 1, 1)
     std = resized.new_tensor(CLIP_STD).view(1, 3, 1, 1)
     pixels = ((resized + 1.0) / 2.0 - mean) / std
     embedded: Tensor = encoder(pixel_values=pixels.to(encoder.dtype)).image_embeds
     return embedded[:, None]
+
+
+def shrink_picture(
+    picture: Float[Tensor, "b 3 H W"], side: int, shrink: Shrinking
+) -> Float[Tensor, "b 3 side side"]:
+    """A picture at the image encoder's size; one that has it already stays."""
+    if picture.shape[-2:] == (side, side):
+        return picture
+    if shrink == "blur":
+        return blur_and_resize(picture, side)
+    return functional.interpolate(
+        picture, size=(side, side), mode="bicubic", align_corners=False, antialias=True
+    )
 
 
 def blur_and_resize(picture: Float[Tensor, "b c H W"], side: int) -> Float[Tensor, "b c side side"]:

@@ -9,6 +9,7 @@ Source: Engelhardt et al. 2025, SViM3D, section 3.
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -50,13 +51,16 @@ def unpack(pictures: dict[str, Float[Tensor, "K 3 H W"]]) -> GeneratedViews:
         name: ((picture.permute(0, 2, 3, 1) + 1.0) / 2.0).clamp(0.0, 1.0)
         for name, picture in pictures.items()
     }
-    mask = sharpen(coverage(planes["normal"]))
-    roughness, metallic = without_background(planes["orm"], mask, 0.0)[..., 1:].split(1, -1)
-    normal = normalize(2.0 * without_background(planes["normal"], mask, 0.0) - 1.0)
+    shown = coverage(planes["normal"])
+    mask = sharpen(shown)
     seen = (mask > 0.0).to(mask)
+    # What is nearly full is taken for full; a rim is divided by the share that it was mixed by.
+    share = torch.where(shown < FULL_COVERAGE, shown, torch.ones_like(shown))
+    roughness, metallic = without_background(planes["orm"], share, 0.0)[..., 1:].split(1, -1)
+    normal = normalize(2.0 * without_background(planes["normal"], share, 0.0) - 1.0)
     return GeneratedViews(
-        rgb_linear=linear_from_srgb(without_background(planes["rgb"], mask, 1.0)) * seen,
-        basecolor=linear_from_srgb(without_background(planes["basecolor"], mask, 1.0)) * seen,
+        rgb_linear=linear_from_srgb(without_background(planes["rgb"], share, 1.0)) * seen,
+        basecolor=linear_from_srgb(without_background(planes["basecolor"], share, 1.0)) * seen,
         roughness=roughness * seen,
         metallic=metallic * seen,
         normal_camera=normal * seen,
@@ -68,7 +72,8 @@ def coverage(normal: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 1"]:
     """Share of a pixel that an encoded normal over black covers.
 
     A pixel p = m (n + 1) / 2 with a unit n gives |2 p - m 1| = m, that is
-    m^2 - 2 m sum(p) + 2 |p|^2 = 0, whose smaller root is the coverage.
+    m^2 - 2 m sum(p) + 2 |p|^2 = 0, whose smaller root is the coverage, unless n.x + n.y + n.z < -1:
+    normals that point far down and to the left, which only faces seen at a grazing angle have.
     """
     total = normal.sum(-1, keepdim=True)
     squares = (normal**2).sum(-1, keepdim=True)

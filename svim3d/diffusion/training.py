@@ -112,7 +112,7 @@ def weighted_loss(
 
 
 def separate_frames(unet: MaterialVideoUNet) -> None:
-    """Let temporal transformers start as identities.
+    """Keep frames apart at first: temporal transformers add the frame's index alone.
 
     A network that is trained from nothing would otherwise see its frames mixed by random weights
     that the first phase leaves as they are.

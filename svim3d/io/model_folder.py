@@ -51,8 +51,10 @@ def write_model(
 def write_description(folder: Path, spec: ModelSpec, card: str) -> None:
     """Write all but the weights."""
     description = {"format": FORMAT, **asdict(spec)}
-    (folder / DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n")
-    (folder / CARD).write_text(card)
+    for name, text in ((CARD, card), (DESCRIPTION, json.dumps(description, indent=1) + "\n")):
+        temporary = folder / f"{name}.tmp"
+        temporary.write_text(text)
+        temporary.replace(folder / name)
 
 
 def read_spec(folder: Path, name: str = DESCRIPTION) -> ModelSpec:

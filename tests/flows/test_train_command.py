@@ -9,6 +9,7 @@ import torch
 from tiny_model import TINY
 
 from flows.cli import main
+from stages.training_folder import TrainingFolder
 from svim3d.io.model_folder import FORMAT, read_model
 from svim3d.io.training_data import write_example
 from svim3d.synthesis.example import TrainingExample
@@ -21,7 +22,6 @@ SETTINGS = (
     "generator.phase_2_steps=2",
     "generator.warm_up=1",
     "generator.precision=float32",
-    "generator.from_scratch=true",
 )
 
 
@@ -92,6 +92,50 @@ def test_a_run_holds_to_its_settings_but_may_be_longer(data, spec, tmp_path, cap
     assert main(command(data, out, spec, "--set", "generator.phase_2_steps=3")) == 0
     assert main(command(data, out, spec, "--set", "generator.batch=3")) == 2
     assert "begun with other settings (config.generator.batch)" in capsys.readouterr().err
+
+
+def test_other_examples_are_not_trained_on_by_the_old_latents(data, spec, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main(command(data, out, spec)) == 0
+    files = sorted(data.iterdir())
+    files[0].write_bytes(files[1].read_bytes())
+    assert main(command(data, out, spec)) == 2
+    assert "begun with other settings (first_example)" in capsys.readouterr().err
+
+
+def test_training_goes_on_from_a_model_folder_and_its_terms(data, spec, tmp_path):
+    """With its weights, its card and its notice, but another number of steps."""
+    assert main(command(data, tmp_path / "first", spec)) == 0
+    source = tmp_path / "first" / "model"
+    (source / "README.md").write_text("Only for research.\n")
+    (source / "NOTICE").write_text("By somebody.\n")
+    out = tmp_path / "second"
+    assert main(command(data, out, source, "--set", "generator.rate_1=1e-9")) == 0
+    assert "Only for research." in (out / "model" / "README.md").read_text()
+    assert (out / "model" / "NOTICE").read_text() == "By somebody.\n"
+    old, new = (read_model(f, torch.device("cpu")) for f in (source, out / "model"))
+    assert torch.equal(old.autoencoder.analysis.weight, new.autoencoder.analysis.weight)
+    for name, value in old.image_encoder.state_dict().items():
+        assert torch.equal(value, new.image_encoder.state_dict()[name]), name
+
+
+def test_a_kill_between_checkpoint_and_model_loses_nothing(data, spec, tmp_path, monkeypatch):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert main(command(data, whole, spec)) == 0
+    keep = TrainingFolder.keep_model
+
+    def stop(self: TrainingFolder, model: object, steps: int = 0) -> None:
+        if steps:
+            raise KeyboardInterrupt
+        keep(self, model)
+
+    monkeypatch.setattr(TrainingFolder, "keep_model", stop)
+    assert main(command(data, killed, spec)) == 130
+    monkeypatch.setattr(TrainingFolder, "keep_model", keep)
+    assert main(command(data, killed, spec)) == 0
+    for name in ("unet", "autoencoder", "image_encoder"):
+        file = f"model/{name}.safetensors"
+        assert (whole / file).read_bytes() == (killed / file).read_bytes(), name
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,9 @@ def run(folder: Path, examples: list[TrainingExample], **changes: object) -> lis
         write_example(file, made)
     with Context("training latents", torch.device("cpu"), 0, folder / "w", folder / "s") as ctx:
         config = LatentsConfig.model_validate(changes)
-        return precompute_latents(tiny_model(), files, folder / "latents", config, ctx)
+        return precompute_latents(
+            tiny_model(), files, folder / "latents", config, ctx, embedded=True
+        )
 
 
 def latents_of(pictures: torch.Tensor) -> torch.Tensor:
