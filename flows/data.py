@@ -67,5 +67,5 @@ def data(options: argparse.Namespace) -> int:
                 console.print(outcome.message, style="yellow", highlight=False, markup=False)
             bars.advance(bar)
     counts = ", ".join(f"{count} {status}" for status, count in tally.items() if count)
-    console.print(f"{options.output}: {counts}", highlight=False)
+    console.print(f"{options.output}: {counts}", highlight=False, soft_wrap=True)
     return DONE

@@ -81,7 +81,9 @@ def train(options: argparse.Namespace) -> int:
         )
     # Also after a kill between the last checkpoint and the model that belongs to it.
     folder.keep_model(model, steps)
-    console.print(f"{folder.model_folder}: a model for svim3d run --model", highlight=False)
+    console.print(
+        f"{folder.model_folder}: a model for svim3d run --model", highlight=False, soft_wrap=True
+    )
     return DONE
 
 

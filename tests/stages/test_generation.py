@@ -334,7 +334,7 @@ def test_another_light_file_makes_other_settings(tmp_path):
     second = GenerationConfig(environment=file)
     assert first.digests != second.digests
     assert GenerationConfig(**second.model_dump()) == second
-    assert not GenerationConfig().digests
+    assert not any(name.startswith("environment") for name in GenerationConfig().digests)
 
 
 def test_light_with_impossible_texels_is_mended_and_told(tmp_path, ctx):
