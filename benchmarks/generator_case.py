@@ -7,6 +7,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
@@ -15,46 +16,9 @@ from svim3d.diffusion.conditioning import Conditioning
 from svim3d.diffusion.guidance import guide
 from svim3d.diffusion.model import PAPER, MaterialDiffusion, ModelSpec, Sampling
 from svim3d.diffusion.sampler import Denoiser
+from svim3d.io.model_folder import read_spec
 
-VAE = {"layers_per_block": 1, "latent_channels": 16, "sample_size": 64}
-
-# The shape of the bundled model's UNet; its autoencoder stands in for the real one.
-SMALL = ModelSpec(
-    name="small",
-    image_size=64,
-    views=21,
-    fov_deg=33.8,
-    latent_scale=1.0,
-    sigma_max=700.0,
-    steps=50,
-    guidance_max=2.5,
-    unet={
-        "in_channels": 80,
-        "out_channels": 64,
-        "block_out_channels": [96, 192],
-        "num_attention_heads": [3, 6],
-        "layers_per_block": 1,
-        "cross_attention_dim": 128,
-        "addition_time_embed_dim": 64,
-        "attention": [True, True],
-    },
-    autoencoder={
-        "block_out_channels": [32, 64, 128, 128],
-        "down_block_types": ["DownEncoderBlock2D"] * 4,
-        "up_block_types": ["UpDecoderBlock2D"] * 4,
-        **VAE,
-    },
-    image_encoder={
-        "hidden_size": 128,
-        "intermediate_size": 512,
-        "num_hidden_layers": 2,
-        "num_attention_heads": 4,
-        "projection_dim": 128,
-        "image_size": 64,
-        "patch_size": 8,
-        "hidden_act": "gelu",
-    },
-)
+SMALL = read_spec(Path(__file__).resolve().parents[1] / "configs", "svim3d-small.json")
 
 # The paper's model at a fifth of its width and 8 x 8 latents, to try the code without a GPU.
 REDUCED = replace(

@@ -10,7 +10,13 @@ from torch import Tensor
 from torch.nn import functional
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from svim3d.diffusion.autoencoder import Autoencoder, build_autoencoder, decode, encode
+from svim3d.diffusion.autoencoder import (
+    PICTURES_AT_A_TIME,
+    Autoencoder,
+    build_autoencoder,
+    decode,
+    encode,
+)
 from svim3d.diffusion.conditioning import (
     Conditioning,
     Shrinking,
@@ -146,7 +152,7 @@ class Sampling:
     guidance_max: float | None = None
     guidance_by: Literal["index", "azimuth"] = "index"
     interval: GuidanceInterval = field(default_factory=GuidanceInterval)
-    decode_at_once: int = 21
+    decode_at_once: int = PICTURES_AT_A_TIME
     compiled: bool = False
 
 

@@ -15,7 +15,6 @@ from diffusers.models.embeddings import Timesteps
 from jaxtyping import Float
 from torch import Tensor, nn
 
-CAMERA_NUMBERS = 3  # noise on the reference view, polar angle, azimuth
 # The width of each angle's sinusoids, in units of that of the noise: 512 and 256 in SV3D.
 ANGLE_WIDTH = 2
 GROUP_NORM_EPS = 1e-5  # diffusers builds most of these norms with 1e-6, SV3D was trained with this
