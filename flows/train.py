@@ -1,7 +1,7 @@
 """`svim3d train`: rendered examples in, a model folder out; goes on where it was stopped.
 
-Autoencoder, latents, generator: each part keeps its state in the run's folder, and what is done is
-not done again. `--minutes` cuts a long training into pieces that end like one.
+Autoencoder, latents, expectation, generator: each part keeps its state in the run's folder, and
+what is done is not done again. `--minutes` cuts a long training into pieces that end like one.
 """
 
 import argparse
@@ -30,10 +30,18 @@ def train(options: argparse.Namespace) -> int:
     config = load_training_config(options.config, options.set)
     from stages.autoencoder_training import train_autoencoder
     from stages.execution import choose_device
+    from stages.expectation_training import train_expectation
     from stages.generator_training import train_generator
     from stages.latents import precompute_latents, read_fitting
     from stages.training_folder import TrainingFolder, examples_of, load_model_spec
     from stages.training_sheet import draw_autoencoder_sheet, draw_generator_sheet
+
+    started_s = time.monotonic()
+
+    def time_left_s() -> float | None:
+        """Of the minutes that were given."""
+        given = options.minutes
+        return None if given is None else max(0.0, 60.0 * given + started_s - time.monotonic())
 
     examples = examples_of(options.data)
     spec = load_model_spec(options.model)
@@ -52,7 +60,7 @@ def train(options: argparse.Namespace) -> int:
             scale = train_autoencoder(model.autoencoder, examples, config.autoencoder, ctx)
         sheet = folder.root / "autoencoder" / "sheet.png"
         draw_autoencoder_sheet(model.autoencoder, examples[-1], sheet)
-        folder.keep_model(model.with_latent_scale(scale))
+        folder.keep_model(model.described(latent_scale=scale))
         model = folder.reread_model()
     with folder.context("latents", every_s) as ctx:
         clips = precompute_latents(
@@ -63,6 +71,15 @@ def train(options: argparse.Namespace) -> int:
             ctx,
             embedded=not from_scratch,
         )
+    if model.expectation is not None and from_scratch:
+        with folder.context("expectation", every_s) as ctx:
+            left_open = train_expectation(model, clips, config.expectation, ctx, time_left_s())
+        if left_open is None:
+            console.print(f"{folder.root}: the expectation is half trained; run the same again")
+            return DONE
+        if left_open != model.spec.residual_scale:
+            folder.keep_model(model.described(residual_scale=left_open))
+        model = folder.reread_model()
     with folder.context("generator", every_s) as ctx:
         steps = train_generator(
             model,
@@ -77,7 +94,7 @@ def train(options: argparse.Namespace) -> int:
                 folder.root / "generator" / f"sheet-{steps:07d}.png",
                 folder.seed,
             ),
-            stop_after_s=None if options.minutes is None else 60.0 * options.minutes,
+            stop_after_s=time_left_s(),
         )
     # Also after a kill between the last checkpoint and the model that belongs to it.
     folder.keep_model(model, steps)

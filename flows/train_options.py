@@ -33,7 +33,7 @@ def train_options() -> argparse.ArgumentParser:
         "--minutes",
         type=float,
         metavar="N",
-        help="stop the generator after so long; the same command goes on",
+        help="stop after so long, once latents are there; the same command goes on",
     )
     options.add_argument("--seed", type=int, default=0, help="(%(default)s)")
     options.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")

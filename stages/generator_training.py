@@ -10,7 +10,7 @@ Source: Engelhardt et al. 2025, SViM3D, section 4.
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -20,8 +20,9 @@ from torch import Tensor, nn
 from stages.base import Context
 from stages.errors import InputError
 from stages.settings.training import GeneratorTrainingConfig
+from stages.training_batches import SeenClip, draw_seen
 from svim3d.diffusion.clips import StoredClip
-from svim3d.diffusion.conditioning import Conditioning, camera_numbers, embed_picture
+from svim3d.diffusion.conditioning import Conditioning, embed_picture
 from svim3d.diffusion.model import MaterialDiffusion
 from svim3d.diffusion.training import (
     Clips,
@@ -179,49 +180,29 @@ def draw_clips(
     ctx: Context,
 ) -> Clips:
     """The batch of a step: objects, lights and reference views, a function of the seed alone."""
-    generator = ctx.generator(f"clips {step}")
-
-    def below(count: int) -> int:
-        return int(torch.randint(count, (1,), generator=generator))
-
-    latents, references, tokens, cameras, good = [], [], [], [], []
-    for _ in range(config.batch):
-        clip = clips[below(len(clips))]
-        light = below(len(clip.rgb))
-        form = int(clip.form[light])
-        views = clip.azimuth_deg.shape[1]
-        turns = config.any_reference and clip.is_even(form)
-        order = clip.frames_seen_from(below(views) if turns else views - 1)
-        groups = torch.cat([clip.rgb[light][None], clip.materials[form]])[:, order].float()
-        latents.append(groups.transpose(0, 1).flatten(1, 2) * model.spec.latent_scale)
-        references.append(groups[0, -1])
-        tokens.append(_token(clip, light, int(order[-1]), model, config, ctx))
-        elevation, azimuth = clip.elevation_deg[form][order], clip.azimuth_deg[form][order]
-        cameras.append(camera_numbers(elevation, azimuth, model.spec.cond_aug))
-        good.append(clip.has_good_materials)
+    seen = draw_seen(clips, config.batch, ctx.generator(f"clips {step}"))
+    latents = torch.stack([one.latents for one in seen]) * model.spec.latent_scale
     return Clips(
-        latents=torch.stack(latents).to(ctx.device),
+        latents=latents.to(ctx.device),
         conditioning=Conditioning(
-            token=torch.cat(tokens),
-            latent=torch.stack(references).to(ctx.device),
-            camera=torch.stack(cameras).to(ctx.device),
+            token=torch.cat([_token(one, model, config, ctx) for one in seen]),
+            latent=torch.stack([one.reference for one in seen]).to(ctx.device),
+            camera=torch.stack([one.camera(model.spec) for one in seen]).to(ctx.device),
         ),
-        has_good_materials=torch.tensor(good, device=ctx.device),
+        has_good_materials=torch.tensor(
+            [one.clip.has_good_materials for one in seen], device=ctx.device
+        ),
     )
 
 
 def _token(
-    clip: StoredClip,
-    light: int,
-    frame: int,
-    model: MaterialDiffusion,
-    config: GeneratorTrainingConfig,
-    ctx: Context,
+    seen: SeenClip, model: MaterialDiffusion, config: GeneratorTrainingConfig, ctx: Context
 ) -> Float[Tensor, "1 1 d"]:
-    """The embedding of a frame: as stored, unless the image encoder learns."""
+    """The embedding of the reference view: as stored, unless the image encoder learns."""
+    clip, frame = seen.clip, int(seen.order[-1])
     if clip.tokens is not None:
-        return clip.tokens[light, frame].float().to(ctx.device)[None, None]
-    shown = clip.pictures[light, frame][None].to(ctx.device).float() / 127.5 - 1.0
+        return clip.tokens[seen.light, frame].float().to(ctx.device)[None, None]
+    shown = clip.pictures[seen.light, frame][None].to(ctx.device).float() / 127.5 - 1.0
     with _autocast(config, ctx):
         return embed_picture(model.image_encoder, shown).float()
 
@@ -237,8 +218,10 @@ def _step(
         spread=config.noise_spread,
         drop_share=config.drop_share,
     ).to(ctx.device)
+    told = fit.model.expecting(clips.conditioning.dropped(draws.drop))
+    left = replace(clips, latents=fit.model.residual(clips.latents, told), conditioning=told)
     with _autocast(config, ctx):
-        errors = velocity_errors(fit.model.unet, clips, draws)
+        errors = velocity_errors(fit.model.unet, left, draws)
     loss = weighted_loss(errors, clips.has_good_materials)
     terms = {"loss": float(loss.detach())}
     terms |= dict(zip(GROUP_TERMS, errors.detach().mean(0).tolist(), strict=True))

@@ -20,7 +20,7 @@ from svim3d.diffusion.model import MaterialDiffusion, ModelSpec
 from svim3d.io.model_folder import CARD, DESCRIPTION, read_spec, write_description
 from svim3d.io.weights import Shape, TensorFile, open_tensors, save_one_by_one
 
-PARTS = ("unet", "autoencoder", "image_encoder")
+PARTS = ("unet", "autoencoder", "image_encoder")  # of a single file
 NOTICE = "NOTICE"
 DTYPES = {"fp16": torch.float16, "bf16": torch.bfloat16, "fp32": torch.float32}
 
@@ -200,7 +200,7 @@ def _describe_folder(folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
     rows = [("kind", "model folder"), ("name", spec.name)]
     shapes: dict[str, dict[str, Shape]] = {}
     types: set[str] = set()
-    for part in PARTS:
+    for part in (*PARTS, *(["expectation"] if spec.expectation else [])):
         with open_tensors(folder / f"{part}.safetensors") as tensors:
             shapes[part] = tensors.shapes
             types |= set(tensors.types.values())

@@ -3,6 +3,7 @@
 settings.json      settings, model and data that the run was begun with
 autoencoder/       checkpoint and losses; sheet.png
 latents/           a clip file per example
+expectation/       checkpoint and losses, of a model that has one
 generator/         checkpoint and losses; sheet-<steps>.png
 model/             a complete model folder, of the last checkpoint
 """

@@ -1,5 +1,7 @@
 """The generator's networks at a size that tests can afford, with weights that all matter."""
 
+from dataclasses import replace
+
 import torch
 
 from svim3d.diffusion.conditioning import Conditioning, camera_numbers
@@ -64,11 +66,20 @@ def tiny_unet(**changed) -> MaterialVideoUNet:
     return unet
 
 
-def tiny_model() -> MaterialDiffusion:
+# The same with an expectation, which its network sees as well.
+EXPECTING = replace(
+    SPEC,
+    unet=SPEC.unet | {"in_channels": 9 * GROUP_CHANNELS},
+    expectation={"width": 16, "layers": 1, "heads": 2, "harmonics": 2},
+    residual_scale=0.6,
+)
+
+
+def tiny_model(spec: ModelSpec = SPEC) -> MaterialDiffusion:
     """A whole generator with fixed random weights."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        model = MaterialDiffusion.untrained(SPEC)
+        model = MaterialDiffusion.untrained(spec)
     for part in model.parts.values():
         stir(part.eval().requires_grad_(False), torch.Generator().manual_seed(1))
     return model

@@ -1,5 +1,6 @@
 """The smallest model that has every part: 16 px pictures, five views, random weights."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -48,11 +49,19 @@ TINY = ModelSpec(
 )
 
 
-def tiny_model(seed: int = 0) -> MaterialDiffusion:
+# The same with an expectation, which its network sees as well.
+EXPECTING = replace(
+    TINY,
+    unet=TINY.unet | {"in_channels": 18},
+    expectation={"width": 16, "layers": 1, "heads": 2, "harmonics": 2},
+)
+
+
+def tiny_model(spec: ModelSpec = TINY, seed: int = 0) -> MaterialDiffusion:
     """Random weights, a function of the seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = MaterialDiffusion.untrained(TINY)
+        model = MaterialDiffusion.untrained(spec)
     for part in model.parts.values():
         part.eval()
     return model
@@ -60,5 +69,5 @@ def tiny_model(seed: int = 0) -> MaterialDiffusion:
 
 def write_tiny_model(folder: Path, seed: int = 0) -> Path:
     """The same as a folder; returns it."""
-    write_model(folder, tiny_model(seed), "A model for tests.\n")
+    write_model(folder, tiny_model(seed=seed), "A model for tests.\n")
     return folder

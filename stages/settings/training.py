@@ -36,6 +36,25 @@ class LatentsConfig(StageConfig):
     """Whether every other light sees the object mirrored, which doubles the shapes."""
 
 
+class ExpectationTrainingConfig(StageConfig):
+    """The regression whose residual the generator diffuses, of a model that has one."""
+
+    steps: PositiveInt = 8000
+    """Optimiser steps."""
+    batch: PositiveInt = 64
+    """Clips of a step."""
+    rate: PositiveFloat = 1e-3
+    """Adam's step after warming up; it falls to a hundredth along a cosine."""
+    warm_up: PositiveInt = 200
+    """Steps over which the rate rises."""
+    clip: PositiveFloat = 1.0
+    """Largest norm of a step's gradient."""
+    drop_share: Share = 0.1
+    """Share of clips that do not see the reference view."""
+    precision: Precision = "bfloat16"
+    """Of matrix products; parameters stay float32."""
+
+
 class GeneratorTrainingConfig(StageConfig):
     """The UNet and, if asked for, the image encoder."""
 
@@ -63,8 +82,6 @@ class GeneratorTrainingConfig(StageConfig):
     """Standard deviation of ln sigma."""
     drop_share: Share = 0.1
     """Share of clips that do not see the reference view."""
-    any_reference: bool = False
-    """Whether any frame of an evenly spaced orbit may stand as its reference view."""
     precision: Precision = "bfloat16"
     """Of matrix products; parameters stay float32."""
     gradient_checkpointing: bool = False
@@ -80,4 +97,5 @@ class TrainingConfig(StageConfig):
 
     autoencoder: AutoencoderTrainingConfig = AutoencoderTrainingConfig()
     latents: LatentsConfig = LatentsConfig()
+    expectation: ExpectationTrainingConfig = ExpectationTrainingConfig()
     generator: GeneratorTrainingConfig = GeneratorTrainingConfig()

@@ -23,14 +23,19 @@ class Conditioning:
         token: the reference view as a whole.
         latent: the reference view's latent, not scaled as the noisy latents are.
         camera: of each frame, see `camera_numbers`.
+        expected: mean of all groups' latents, from a model that has an `Expectation`.
     """
 
     token: Float[Tensor, "b 1 d"]
     latent: Float[Tensor, "b z h w"]
     camera: Float[Tensor, "b k 3"]
+    expected: Float[Tensor, "b k c h w"] | None = None
 
     def dropped(self, drop: Float[Tensor, "b"]) -> Self:
-        """Without the reference view where `drop` is 1; the cameras stay."""
+        """Without the reference view where `drop` is 1; the cameras stay.
+
+        What is expected of the rest has to be asked anew.
+        """
         keep = 1.0 - drop
         return type(self)(
             token=self.token * keep.view(-1, 1, 1).to(self.token),
@@ -47,11 +52,19 @@ class Conditioning:
             camera=torch.cat([self.camera, self.camera]),
         )
 
-    def beside(self, noisy: Float[Tensor, "b k c h w"]) -> Float[Tensor, "b k c_and_z h w"]:
-        """The network's picture input: noisy latents, and the reference view's beside each."""
-        frames = noisy.shape[1]
-        latent = self.latent[:, None].expand(-1, frames, -1, -1, -1).to(noisy)
-        return torch.cat([noisy, latent], 2)
+    @property
+    def pictures(self) -> Float[Tensor, "b k_or_1 p h w"]:
+        """What the network sees beside the noisy latents: what is expected, the reference view."""
+        latent = self.latent[:, None]
+        if self.expected is None:
+            return latent
+        frames = self.expected.shape[1]
+        return torch.cat([self.expected, latent.expand(-1, frames, -1, -1, -1)], 2)
+
+    def beside(self, noisy: Float[Tensor, "b k c h w"]) -> Float[Tensor, "b k c_and_p h w"]:
+        """The network's picture input: noisy latents, and `pictures` beside each."""
+        pictures = self.pictures.expand(-1, noisy.shape[1], -1, -1, -1)
+        return torch.cat([noisy, pictures.to(noisy)], 2)
 
 
 def camera_numbers(

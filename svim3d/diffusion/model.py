@@ -23,6 +23,7 @@ from svim3d.diffusion.conditioning import (
     camera_numbers,
     embed_picture,
 )
+from svim3d.diffusion.expectation import Expectation
 from svim3d.diffusion.groups import GROUPS, GeneratedViews, as_network_input, unpack
 from svim3d.diffusion.guidance import (
     GuidanceInterval,
@@ -59,6 +60,9 @@ class ModelSpec:
         unet: arguments of `MaterialVideoUNet`.
         autoencoder: arguments of diffusers' `AutoencoderKL` or of `PatchAutoencoder`.
         image_encoder: arguments of transformers' `CLIPVisionConfig`.
+        expectation: arguments of `Expectation` beyond those that follow from the others; None for a
+            model that diffuses latents themselves.
+        residual_scale: what an expectation leaves open, as a standard deviation of latents.
     """
 
     name: str
@@ -79,6 +83,8 @@ class ModelSpec:
     transfer: Literal["srgb"] = "srgb"
     shrink: Shrinking = "antialias"
     groups: tuple[str, ...] = field(default=GROUPS)
+    expectation: dict[str, Any] | None = None
+    residual_scale: float = 1.0
 
     @property
     def latent_side(self) -> int:
@@ -157,13 +163,14 @@ class Sampling:
 
 
 class MaterialDiffusion:
-    """UNet, autoencoder and image encoder, and how to draw an orbit with them.
+    """UNet, autoencoder, image encoder and expectation, and how to draw an orbit with them.
 
     Args:
         spec: what the weights are for.
         unet: sees frames together.
         autoencoder: sees one picture of one group at a time.
         image_encoder: sees the reference view.
+        expectation: what the UNet's latents are residuals of, if they are.
     """
 
     def __init__(
@@ -172,11 +179,13 @@ class MaterialDiffusion:
         unet: MaterialVideoUNet,
         autoencoder: Autoencoder,
         image_encoder: CLIPVisionModelWithProjection,
+        expectation: Expectation | None = None,
     ) -> None:
         self.spec = spec
         self.unet = unet
         self.autoencoder = autoencoder
         self.image_encoder = image_encoder
+        self.expectation = expectation
 
     @classmethod
     def untrained(cls, spec: ModelSpec) -> "MaterialDiffusion":
@@ -186,21 +195,30 @@ class MaterialDiffusion:
             MaterialVideoUNet(**spec.unet),
             build_autoencoder(spec.autoencoder),
             CLIPVisionModelWithProjection(CLIPVisionConfig(**spec.image_encoder)),
+            None
+            if spec.expectation is None
+            else Expectation(
+                latent_channels=spec.latent_channels,
+                side=spec.latent_side,
+                groups=len(spec.groups),
+                **spec.expectation,
+            ),
         )
 
-    def with_latent_scale(self, scale: float) -> "MaterialDiffusion":
-        """The same networks with latents scaled differently."""
-        spec = replace(self.spec, latent_scale=scale)
-        return MaterialDiffusion(spec, self.unet, self.autoencoder, self.image_encoder)
+    def described(self, **changes: Any) -> "MaterialDiffusion":
+        """The same networks under a description with other values."""
+        networks = (self.unet, self.autoencoder, self.image_encoder, self.expectation)
+        return MaterialDiffusion(replace(self.spec, **changes), *networks)
 
     @property
     def parts(self) -> dict[str, torch.nn.Module]:
         """The networks by the names of their files."""
-        return {
+        parts: dict[str, Any] = {
             "unet": self.unet,
             "autoencoder": self.autoencoder,
             "image_encoder": self.image_encoder,
         }
+        return parts if self.expectation is None else parts | {"expectation": self.expectation}
 
     @property
     def device(self) -> torch.device:
@@ -267,39 +285,76 @@ class MaterialDiffusion:
         Its plain twin: `denoise` without and with the reference view, and `guide` between them.
         """
         network = PreparedUNet(self.unet, compiled=sampling.compiled)
-        alone = network.bind(conditioning)
-        both = network.bind(conditioning.beside_unconditional())
+        alone = self.expecting(conditioning)
+        both = self.expecting(conditioning.beside_unconditional())
+        bound_alone, bound_both = network.bind(alone), network.bind(both)
         weights = self.guidance(conditioning, sampling).to(self.device)
         guides = bool((weights != 1.0).any())
 
         def denoise(noisy: Tensor, sigma: float) -> Tensor:
-            level = torch.tensor([sigma], dtype=torch.float64)
-            told = c_noise(level).to(self.device, torch.float32)
-            scaled = noisy * float(c_in(level))
             # Frames of weight 1 need the unconditional branch too: their neighbours see them in it.
-            if guides and sampling.interval.holds(sigma):
-                without, given = network(scaled, told, both).to(noisy.dtype).chunk(2)
-                answer = guide(without, given, weights)
-            else:
-                answer = network(scaled, told, alone).to(noisy.dtype)
-            return denoised(noisy, answer, level.to(noisy))
+            guided = guides and sampling.interval.holds(sigma)
+            told, bound = (both, bound_both) if guided else (alone, bound_alone)
+            residual = self.residual(noisy, told)
+            level = self._level(sigma)
+            known = c_noise(level).to(self.device, torch.float32)
+            answer = network(residual * float(c_in(level)), known, bound).to(noisy.dtype)
+            residual = residual.expand_as(answer)
+            clean = self.whole(
+                denoised(residual, answer, level.expand(len(answer)).to(noisy)), told
+            )
+            if not guided:
+                return clean
+            without, given = clean.chunk(2)
+            return guide(without, given, weights)
 
         return denoise
+
+    @torch.no_grad()
+    def expecting(self, conditioning: Conditioning) -> Conditioning:
+        """The same, with what the model expects of it, if it is one that does."""
+        if self.expectation is None:
+            return conditioning
+        weights = self.expectation.position.dtype
+        expected = self.expectation(conditioning.latent.to(weights), conditioning.camera)
+        return replace(conditioning, expected=expected)
+
+    def residual(
+        self, latents: Float[Tensor, "n k c h w"], told: Conditioning
+    ) -> Float[Tensor, "b k c h w"]:
+        """What is diffused: latents less what is expected of them, of unit variance."""
+        if told.expected is None:
+            return latents
+        return (latents - told.expected.to(latents)) / self.spec.residual_scale
+
+    def whole(
+        self, residual: Float[Tensor, "b k c h w"], told: Conditioning
+    ) -> Float[Tensor, "b k c h w"]:
+        """Latents from their residual."""
+        if told.expected is None:
+            return residual
+        return told.expected.to(residual) + self.spec.residual_scale * residual
+
+    def _level(self, sigma: float) -> Float[Tensor, "1"]:
+        """The noise level that latents' noise is to their residual."""
+        return torch.tensor([sigma / self.spec.residual_scale], dtype=torch.float64)
 
     def denoise(
         self, noisy: Float[Tensor, "b k c h w"], sigma: float, conditioning: Conditioning
     ) -> Float[Tensor, "b k c h w"]:
         """The clean latents that the network expects behind noisy ones."""
-        level = torch.full((len(noisy),), sigma, dtype=torch.float64)
+        told = self.expecting(conditioning)
+        residual = self.residual(noisy, told)
+        level = self._level(sigma).expand(len(noisy))
         weights = self.unet.conv_in.weight.dtype
         answer = self.unet(
-            # The reference view's latent is not scaled.
-            conditioning.beside(noisy * float(c_in(level[0]))).to(weights),
+            # Only what is noisy is scaled.
+            told.beside(residual * float(c_in(level[0]))).to(weights),
             c_noise(level).to(noisy.device, torch.float32),
-            conditioning.token.to(weights),
-            conditioning.camera,
+            told.token.to(weights),
+            told.camera,
         )
-        return denoised(noisy, answer.to(noisy.dtype), level.to(noisy))
+        return self.whole(denoised(residual, answer.to(noisy.dtype), level.to(noisy)), told)
 
     @torch.no_grad()
     def decode(

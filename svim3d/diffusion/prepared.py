@@ -37,12 +37,12 @@ class BoundConditioning:
 
     Attributes:
         camera: embedding of each frame's camera.
-        picture: the reference view's latent after the first convolution, with its bias.
+        pictures: `Conditioning.pictures` after the first convolution, with its bias.
         transformers: what `PreparedTransformer.bind` gave for each of them.
     """
 
     camera: Float[Tensor, "b k d"]
-    picture: Float[Tensor, "b 1 h w c"]
+    pictures: Float[Tensor, "b k_or_1 h w c"]
     transformers: list[tuple[Tensor, ...]]
 
 
@@ -78,13 +78,15 @@ class PreparedUNet:
         """Compute what stays the same over all noise levels."""
         unet, first = self.unet, self.unet.conv_in
         batch, frames, _ = conditioning.camera.shape
-        latent = conditioning.latent.to(first.weight.dtype)
-        weight = first.weight[:, -latent.shape[1] :]
-        picture = functional.conv2d(latent, weight, first.bias, padding=first.padding)
+        seen = conditioning.pictures.to(first.weight.dtype)
+        weight = first.weight[:, -seen.shape[2] :]
+        pictures = functional.conv2d(
+            seen.flatten(0, 1), weight, first.bias, padding=first.padding
+        ).unflatten(0, seen.shape[:2])
         token = conditioning.token.to(first.weight.dtype)
         return BoundConditioning(
             camera=unet.embed_camera(conditioning.camera).unflatten(0, (batch, frames)),
-            picture=picture.permute(0, 2, 3, 1)[:, None].contiguous(),
+            pictures=pictures.permute(0, 1, 3, 4, 2).contiguous(),
             transformers=[
                 layer.bind(token, frames)
                 for _, layer in self._steps
@@ -103,7 +105,8 @@ class PreparedUNet:
 
         Args:
             noisy: scaled noisy latents of all groups. Fewer clips than conditionings are repeated
-                over them: both branches of guidance begin with the same latents.
+                over them: both branches of guidance begin with the same latents, unless they
+                expect different ones.
             noise_level: `karras.c_noise`, the same for all.
             bound: from `bind`.
 
@@ -113,8 +116,8 @@ class PreparedUNet:
         unet, told = self.unet, iter(bound.transformers)
         unet.check_sides(noisy)
         shifts = iter(self._shifts(noise_level, bound.camera))
-        clips = len(bound.picture) // len(noisy)
-        hidden = self._first(noisy).repeat(clips, 1, 1, 1, 1) + bound.picture
+        clips = len(bound.pictures) // len(noisy)
+        hidden = self._first(noisy).repeat(clips, 1, 1, 1, 1) + bound.pictures
         with dynamo_config.patch(self._shapes_allowed):
             hidden = self._walk(hidden, shifts, told)
         hidden = functional.silu(group_norm(unet.conv_norm_out, hidden))

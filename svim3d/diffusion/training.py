@@ -27,7 +27,7 @@ class Clips:
     """A batch of clips to learn from.
 
     Attributes:
-        latents: all groups, of unit variance.
+        latents: all groups, of unit variance; for `velocity_errors` what is diffused of them.
         conditioning: what the network is told.
         has_good_materials: whether basecolor, roughness and metallic can be trusted.
     """
@@ -92,7 +92,7 @@ def velocity_errors(
     """Mean squared error of the network's answer, per clip and group."""
     level = over_batch(draws.sigma, clips.latents)
     noisy = clips.latents + level * draws.noise
-    told = clips.conditioning.dropped(draws.drop)
+    told = clips.conditioning
     answer = unet(
         told.beside(noisy * c_in(level)), c_noise(draws.sigma), told.token, told.camera
     ).float()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_model import TINY
+from tiny_model import EXPECTING, TINY
 
 from flows.cli import main
 from stages.training_folder import TrainingFolder
@@ -14,10 +14,13 @@ from svim3d.io.model_folder import FORMAT, read_model
 from svim3d.io.training_data import write_example
 from svim3d.synthesis.example import TrainingExample
 
-SPEC = replace(TINY, autoencoder={"patch": 4, "latent_channels": 2, "hidden": 8, "layers": 1})
+AUTOENCODER = {"patch": 4, "latent_channels": 2, "hidden": 8, "layers": 1}
+SPEC = replace(TINY, autoencoder=AUTOENCODER)
 SETTINGS = (
     "autoencoder.steps=4",
     "autoencoder.batch=4",
+    "expectation.steps=3",
+    "expectation.batch=2",
     "generator.phase_1_steps=2",
     "generator.phase_2_steps=2",
     "generator.warm_up=1",
@@ -84,6 +87,24 @@ def test_pieces_leave_the_same_model(data, spec, tmp_path):
     for name in ("unet", "autoencoder", "image_encoder"):
         file = f"model/{name}.safetensors"
         assert (whole / file).read_bytes() == (pieces / file).read_bytes(), name
+
+
+def test_an_expectation_is_trained_before_the_generator_and_in_pieces(data, tmp_path):
+    spec = tmp_path / "expecting.json"
+    expecting = replace(EXPECTING, autoencoder=AUTOENCODER)
+    spec.write_text(json.dumps({"format": FORMAT, **asdict(expecting)}))
+    whole, pieces = tmp_path / "whole", tmp_path / "pieces"
+    assert main(command(data, whole, spec)) == 0
+    # A step each, 3 of the expectation (the last one goes on with the generator) and 4 more.
+    for _ in range(7):
+        assert main(command(data, pieces, spec, "--minutes", "0")) == 0
+    one, two = (read_model(run / "model", torch.device("cpu")) for run in (whole, pieces))
+    assert one.spec == two.spec
+    assert one.spec.residual_scale not in (0.0, 1.0)
+    for part, network in one.parts.items():
+        for name, value in network.state_dict().items():
+            assert torch.equal(value, two.parts[part].state_dict()[name]), (part, name)
+    assert one.expectation.head.weight.any()
 
 
 def test_a_run_holds_to_its_settings_but_may_be_longer(data, spec, tmp_path, capsys):

@@ -129,7 +129,7 @@ def test_the_image_encoder_learns_in_phase_1_of_a_model_from_scratch(tmp_path):
 def test_pieces_end_like_one_run(tmp_path):
     """Stopped after any step, a run goes on to the same bytes."""
     clips = [stored_clip(0), stored_clip(1, good=False)]
-    config = settings(any_reference=True)
+    config = settings()
     whole = weights(run(tmp_path / "whole", config, clips, from_scratch=True))
     for _ in range(config.phase_1_steps + config.phase_2_steps):
         pieces = run(tmp_path / "pieces", config, clips, stop_after_s=0.0, from_scratch=True)
@@ -139,7 +139,7 @@ def test_pieces_end_like_one_run(tmp_path):
 def test_same_seed_same_batches_and_other_steps_others(tmp_path):
     clips, model = [stored_clip(0), stored_clip(1)], tiny_model()
     ctx = Context("training generator", CPU, 0, tmp_path / "work", tmp_path / "shared")
-    config = settings(any_reference=True)
+    config = settings()
     one, two, other = (draw_clips(clips, model, step, config, ctx) for step in (5, 5, 6))
     assert torch.equal(one.latents, two.latents)
     assert not torch.equal(one.latents, other.latents)
@@ -149,7 +149,7 @@ def test_a_batch_shows_one_frame_as_reference_everywhere(tmp_path):
     """Latent, picture and camera of the reference view are those of the last frame."""
     clip, model = stored_clip(0), tiny_model()
     ctx = Context("training generator", CPU, 0, tmp_path / "work", tmp_path / "shared")
-    batch = draw_clips([clip], model, 0, settings(any_reference=True, batch=16), ctx)
+    batch = draw_clips([clip], model, 0, settings(batch=16), ctx)
     scale, z = model.spec.latent_scale, model.spec.latent_channels
     seen = set()
     for index in range(16):
@@ -178,7 +178,7 @@ def test_stored_tokens_are_what_the_encoder_says(tmp_path):
     with torch.no_grad():
         tokens = torch.stack([embed_picture(model.image_encoder, p)[:, 0] for p in shown])
     ctx = Context("training generator", CPU, 0, tmp_path / "work", tmp_path / "shared")
-    config = settings(any_reference=True, batch=8)
+    config = settings(batch=8)
     made = draw_clips([clip], model, 0, config, ctx)
     stored = draw_clips([replace(clip, tokens=tokens.half())], model, 0, config, ctx)
     # Half precision keeps 11 bits.
@@ -219,10 +219,16 @@ def test_it_overfits_one_clip(tmp_path):
         decay=0.98,
         drop_share=0.0,
     )
-    one_light = replace(clip, rgb=clip.rgb[:1], form=clip.form[:1], pictures=clip.pictures[:1])
+    one_light = replace(
+        clip,
+        rgb=clip.rgb[:1],
+        form=clip.form[:1],
+        pictures=clip.pictures[:1],
+        elevation_deg=clip.elevation_deg + torch.arange(TINY.views),  # one reference view alone
+    )
     model = run(tmp_path, config, [one_light], from_scratch=True)
     picture = clip.pictures[0, -1].float() / 127.5 - 1.0
-    camera = camera_numbers(clip.elevation_deg[0], clip.azimuth_deg[0], TINY.cond_aug)
+    camera = camera_numbers(one_light.elevation_deg[0], clip.azimuth_deg[0], TINY.cond_aug)
     told = Conditioning(
         token=embed_picture(model.image_encoder, picture[None]),
         latent=clip.rgb[0, -1][None].float(),

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_diffusion import FRAMES, SPEC, tiny_model
+from tiny_diffusion import EXPECTING, FRAMES, SPEC, tiny_model
 
 from svim3d.cameras import CameraPath
 from svim3d.diffusion.guidance import GuidanceInterval, guide
@@ -41,8 +41,9 @@ def plain_draw(model, told, seed, sampling) -> torch.Tensor:
         Sampling(steps=5, interval=GuidanceInterval(0.28, 5.42)),
     ],
 )
-def test_drawing_is_its_plain_twin(sampling):
-    model = tiny_model()
+@pytest.mark.parametrize("spec", [SPEC, EXPECTING], ids=["plain", "expecting"])
+def test_drawing_is_its_plain_twin(sampling, spec):
+    model = tiny_model(spec)
     told = model.condition(a_picture(), *PATH.tensors())
     drawn = model.draw(told, 3, sampling)
     slow = plain_draw(model, told, 3, sampling)
@@ -99,8 +100,33 @@ def test_decoding_scales_groups_and_keeps_their_order():
     assert torch.equal(other.normal_camera, views.normal_camera)
     assert torch.equal(other.rgb_linear, views.rgb_linear)
     # A model whose latents are twice as wide shows the same when they are scaled twice as much.
-    wider = MaterialDiffusion(replace(SPEC, latent_scale=1.0), *model.parts.values())
+    wider = model.described(latent_scale=1.0)
     assert torch.equal(wider.decode(2.0 * latents).rgb_linear, views.rgb_linear)
+
+
+def test_the_network_draws_what_the_expectation_leaves_open():
+    """A denoiser of residuals at the residual's noise level, and back."""
+    model = tiny_model(EXPECTING)
+    told = model.condition(a_picture(), *PATH.tensors())
+    noisy, sigma, scale = torch.randn(1, FRAMES, 16, 8, 8), 3.0, EXPECTING.residual_scale
+    expected = model.expectation(told.latent, told.camera)
+    unscaled = MaterialDiffusion(SPEC, *list(model.parts.values())[:3])
+    seeing = replace(told, expected=expected)
+    shifted = expected + (noisy - expected) / scale
+    residual = unscaled.denoise(shifted, sigma / scale, seeing) - expected
+    wanted = expected + scale * residual
+    torch.testing.assert_close(model.denoise(noisy, sigma, told), wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_a_withheld_reference_view_is_not_in_what_is_expected():
+    model = tiny_model(EXPECTING)
+    told = model.expecting(model.condition(a_picture(), *PATH.tensors()))
+    other = model.expecting(model.condition(1.0 - a_picture(), *PATH.tensors()))
+    assert not torch.equal(told.expected, other.expected)
+    both = model.expecting(told.beside_unconditional())
+    torch.testing.assert_close(both.expected[1:], told.expected)
+    nothing = model.expecting(other.dropped(torch.ones(1)))
+    torch.testing.assert_close(both.expected[:1], nothing.expected)
 
 
 def test_half_precision_weights_keep_a_float32_state():
