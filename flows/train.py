@@ -20,6 +20,7 @@ from stages.settings.training import TrainingConfig
 
 if TYPE_CHECKING:
     from stages.base import Progress
+    from stages.training_folder import TrainingFolder
 
 TELL_EVERY_S = 30.0
 SHOWN_CLIPS = 2  # orbits on a sheet
@@ -28,20 +29,16 @@ SHOWN_CLIPS = 2  # orbits on a sheet
 def train(options: argparse.Namespace) -> int:
     """Train what the command line names; see `svim3d train --help`."""
     config = load_training_config(options.config, options.set)
-    from stages.autoencoder_training import train_autoencoder
     from stages.execution import choose_device
-    from stages.expectation_training import train_expectation
     from stages.generator_training import train_generator
     from stages.latents import precompute_latents, read_fitting
     from stages.training_folder import TrainingFolder, examples_of, load_model_spec
-    from stages.training_sheet import draw_autoencoder_sheet, draw_generator_sheet
+    from stages.training_sheet import draw_generator_sheet
 
-    started_s = time.monotonic()
+    over_s = None if options.minutes is None else time.monotonic() + 60.0 * options.minutes
 
     def time_left_s() -> float | None:
-        """Of the minutes that were given."""
-        given = options.minutes
-        return None if given is None else max(0.0, 60.0 * given + started_s - time.monotonic())
+        return None if over_s is None else max(0.0, over_s - time.monotonic())
 
     examples = examples_of(options.data)
     spec = load_model_spec(options.model)
@@ -54,32 +51,20 @@ def train(options: argparse.Namespace) -> int:
     from_scratch = not options.model.is_dir()
     interrupt_on_stop()
     every_s = config.generator.checkpoint_every_s
-    model = folder.start_model(spec, options.model)
-    if not folder.has_autoencoder:
-        with folder.context("autoencoder", every_s) as ctx:
-            scale = train_autoencoder(model.autoencoder, examples, config.autoencoder, ctx)
-        sheet = folder.root / "autoencoder" / "sheet.png"
-        draw_autoencoder_sheet(model.autoencoder, examples[-1], sheet)
-        folder.keep_model(model.described(latent_scale=scale))
-        model = folder.reread_model()
+    _start(folder, options.model, examples, config)
     with folder.context("latents", every_s) as ctx:
         clips = precompute_latents(
-            model,
+            folder.reread_model(),
             examples,
             folder.root / "latents",
             config.latents,
             ctx,
             embedded=not from_scratch,
         )
-    if model.expectation is not None and from_scratch:
-        with folder.context("expectation", every_s) as ctx:
-            left_open = train_expectation(model, clips, config.expectation, ctx, time_left_s())
-        if left_open is None:
-            console.print(f"{folder.root}: the expectation is half trained; run the same again")
-            return DONE
-        if left_open != model.spec.residual_scale:
-            folder.keep_model(model.described(residual_scale=left_open))
-        model = folder.reread_model()
+    if from_scratch and not _expect(folder, clips, config, time_left_s()):
+        console.print(f"{folder.root}: the expectation is half trained; run the same again")
+        return DONE
+    model = folder.reread_model()
     with folder.context("generator", every_s) as ctx:
         steps = train_generator(
             model,
@@ -102,6 +87,43 @@ def train(options: argparse.Namespace) -> int:
         f"{folder.model_folder}: a model for svim3d run --model", highlight=False, soft_wrap=True
     )
     return DONE
+
+
+def _start(
+    folder: "TrainingFolder", source: Path, examples: Sequence[Path], config: TrainingConfig
+) -> None:
+    """Let the folder hold a model with a trained autoencoder."""
+    from stages.autoencoder_training import train_autoencoder
+    from stages.training_folder import load_model_spec
+    from stages.training_sheet import draw_autoencoder_sheet
+
+    model = folder.start_model(load_model_spec(source), source)
+    if folder.has_autoencoder:
+        return
+    with folder.context("autoencoder", config.generator.checkpoint_every_s) as ctx:
+        scale = train_autoencoder(model.autoencoder, examples, config.autoencoder, ctx)
+    sheet = folder.root / "autoencoder" / "sheet.png"
+    draw_autoencoder_sheet(model.autoencoder, examples[-1], sheet)
+    folder.keep_model(model.described(latent_scale=scale))
+
+
+def _expect(
+    folder: "TrainingFolder",
+    clips: Sequence[Path],
+    config: TrainingConfig,
+    stop_after_s: float | None,
+) -> bool:
+    """Let the folder's model have a trained expectation, if it has one; False if stopped before."""
+    from stages.expectation_training import train_expectation
+
+    model = folder.reread_model()
+    if model.expectation is None:
+        return True
+    with folder.context("expectation", config.generator.checkpoint_every_s) as ctx:
+        left_open = train_expectation(model, clips, config.expectation, ctx, stop_after_s)
+    if left_open not in (None, model.spec.residual_scale):
+        folder.keep_model(model.described(residual_scale=left_open))
+    return left_open is not None
 
 
 def load_training_config(file: Path | None, overrides: Sequence[str]) -> TrainingConfig:

@@ -36,6 +36,7 @@ CONTRACT = (
     "stages.errors",
     "stages.prefilter_cache",
     "stages.subject",
+    "stages.training_batches",
     "stages.settings",
 )
 MAY_IMPORT = {
