@@ -31,6 +31,7 @@ from svim3d.io.light import read_light
 from svim3d.io.obj import read_obj
 from svim3d.io.training_data import example_file, is_whole, read_example_metadata, write_example
 from svim3d.mesh.source_mesh import SourceMesh, normalised
+from svim3d.synthesis.example import TrainingExample
 from svim3d.synthesis.examples import FOV_DEG, Renderer, Shot, render_example
 from svim3d.synthesis.lights import SIZE
 from svim3d.synthesis.scenes import micropolygons
@@ -205,15 +206,26 @@ def make_example(request: DataRequest, index: int) -> Outcome:
 
 
 def _make(request: DataRequest, index: int, file: Path) -> Outcome:
-    """Render and write one example."""
-    mesh = None
-    if request.meshes:
+    """Render and write one example, or tell which mesh cannot be rendered."""
+    if not request.meshes:
+        example = _rendered(request, index, None)
+    else:
         path = request.meshes[index % len(request.meshes)]
         try:
-            mesh = (path.stem, _mesh(path))
+            example = _rendered(request, index, (path.stem, _mesh(path)))
+        except InputError:  # not of the mesh, but of what all of them need
+            raise
         except Exception as error:  # of any kind: one broken file must not end the run
             return Outcome(index, "skipped", f"{path} was left out: {error}")
-    example = render_example(
+    metadata = {**example.metadata, "backend": request.backend}
+    write_example(file, replace(example, metadata=metadata))
+    return Outcome(index, "made")
+
+
+def _rendered(
+    request: DataRequest, index: int, mesh: tuple[str, SourceMesh] | None
+) -> TrainingExample:
+    return render_example(
         request.seed,
         index,
         cached_operator(request.cache, SIZE),
@@ -224,9 +236,6 @@ def _make(request: DataRequest, index: int, file: Path) -> Outcome:
         maps=_maps(request.environments),
         renderer=_renderer(request, index),
     )
-    metadata = {**example.metadata, "backend": request.backend}
-    write_example(file, replace(example, metadata=metadata))
-    return Outcome(index, "made")
 
 
 def _renderer(request: DataRequest, index: int) -> Renderer | None:

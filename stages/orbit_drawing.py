@@ -15,7 +15,7 @@ from stages.settings.generation import GenerationConfig
 from svim3d.cameras import Cameras, orbit_angles, orbit_cameras
 from svim3d.color import linear_from_srgb
 from svim3d.diffusion.agreement import choose
-from svim3d.diffusion.groups import GeneratedViews
+from svim3d.diffusion.groups import GROUPS, GeneratedViews
 from svim3d.diffusion.guidance import GuidanceInterval
 from svim3d.diffusion.model import MaterialDiffusion, Sampling
 from svim3d.io.model_folder import bundled_model, read_model
@@ -36,7 +36,13 @@ def views_of_photo(
         ValueError: there is no model, or what it draws is no object before a background.
     """
     dtype = _dtype(config, ctx.device)
-    model = read_model(config.model or bundled_model(), ctx.device, dtype)
+    folder = config.model or bundled_model()
+    model = read_model(folder, ctx.device, dtype)
+    if set(model.spec.groups) != set(GROUPS):
+        raise ValueError(
+            f"wanted a model of the groups {', '.join(GROUPS)}, {folder} has "
+            f"{', '.join(model.spec.groups)} alone; convert it with --groups 4 and train it"
+        )
     angles = camera_path(config, model.spec.views)
     samples = draw_samples(model, photo, angles, config, ctx)
     confidence = None
@@ -86,7 +92,7 @@ def draw_samples(
     sampling = Sampling(
         steps=config.sampler_steps,
         guidance_max=config.guidance_max,
-        guidance_by=config.guidance_by,
+        guidance_by=config.guidance_by or ("azimuth" if config.path == "list" else "index"),
         interval=GuidanceInterval(*(config.guidance_interval or ())),
         compiled=config.compiled,
     )
@@ -98,6 +104,11 @@ def draw_samples(
 
         seed = ctx.generator(f"sample {number}").initial_seed()
         latents = model.draw(conditioning, seed, sampling, report)
+        if not torch.isfinite(latents).all():
+            raise ValueError(
+                "the generator's numbers are not finite; try --set generation.dtype=float32, or a "
+                "weaker --set generation.guidance_max"
+            )
         samples.append(_on_cpu(model.decode(latents, sampling)))
     return samples
 

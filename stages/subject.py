@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Protocol
 
 from svim3d.cameras import Cameras, fitting_radius, look_at_origin, orbit_angles, orbit_cameras
+from svim3d.io.light import DISPLAY_SUFFIXES
 from svim3d.io.orbit import read_frame, read_orbit
 from svim3d.io.scene import read_object
 from svim3d.mesh.source_mesh import SourceMesh, normalised
@@ -117,6 +118,11 @@ def read_subject(source: Path, at: Viewpoint, notify: Callable[[str, str], None]
         assumed = Cameras(pose[None], at.fov_y_deg, at.size, at.size)
         cameras, images = read_frame(source, assumed, wanted=BUFFERS, notify=notify)
         return PictureSubject(GBuffer.of(cameras, images), 0)
+    if source.suffix.lower() in DISPLAY_SUFFIXES:
+        raise ValueError(
+            f"{source} is a picture, which has no materials to relight; make views of it first: "
+            f"svim3d run {source.name}, then relight the run's folder"
+        )
     mesh = normalised(read_object(source), source.name)
     cameras = orbit_cameras(
         orbit_angles(at.views, at.elevation_deg, 0.0),

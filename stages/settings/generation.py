@@ -26,7 +26,7 @@ class PhotoSettings(FileReadingConfig):
     """Where the cameras stand: at one elevation, on a rising and falling orbit, or at `angles`."""
 
     elevation_deg: Elevation = 10.0
-    """Elevation of the photo's camera, and of a static orbit. The bundled model knows 10 only."""
+    """Elevation of the photo's camera, and of a static orbit."""
 
     swing_deg: float = Field(default=20.0, ge=0.0, lt=30.0)
     """A sine orbit rises and falls by this much."""
@@ -44,8 +44,9 @@ class PhotoSettings(FileReadingConfig):
     guidance_max: float | None = Field(default=None, ge=1.0, le=20.0)
     """Strength of guidance behind the object; None takes the model's own."""
 
-    guidance_by: Literal["index", "azimuth"] = "index"
-    """How guidance grows from the photo's view: with the frame's number (SV3D), or its azimuth."""
+    guidance_by: Literal["index", "azimuth"] | None = None
+    """How guidance grows from the photo's view: with the frame's number (SV3D), or its azimuth;
+    None takes the number on an orbit, the azimuth where cameras are listed."""
 
     guidance_interval: tuple[NoiseLevel, NoiseLevel] | None = None
     """Noise levels between which guidance acts; None is all of them. Source: Kynkaanniemi 2024."""
@@ -68,6 +69,15 @@ class PhotoSettings(FileReadingConfig):
             raise ValueError(
                 "wanted at least 3 cameras of which the last stands at azimuth 0, where the photo "
                 f"was taken; got {self.angles}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _interval_ascends(self) -> Self:
+        if self.guidance_interval and self.guidance_interval[0] >= self.guidance_interval[1]:
+            raise ValueError(
+                "wanted guidance_interval as a smaller and a larger noise level, got "
+                f"{list(self.guidance_interval)}"
             )
         return self
 

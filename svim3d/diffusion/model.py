@@ -55,7 +55,6 @@ class ModelSpec:
         guidance_min: strength at the reference view.
         guidance_max: strength behind.
         cond_aug: noise that the network believes to be on the reference view.
-        transfer: how RGB is encoded for display.
         shrink: how the image encoder's picture was made smaller in training.
         unet: arguments of `MaterialVideoUNet`.
         autoencoder: arguments of diffusers' `AutoencoderKL` or of `PatchAutoencoder`.
@@ -80,7 +79,6 @@ class ModelSpec:
     sigma_min: float = 0.002
     rho: float = 7.0
     cond_aug: float = 1e-5
-    transfer: Literal["srgb"] = "srgb"
     shrink: Shrinking = "antialias"
     groups: tuple[str, ...] = field(default=GROUPS)
     expectation: dict[str, Any] | None = None

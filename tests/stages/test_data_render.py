@@ -8,6 +8,7 @@ import pytest
 import torch
 from fake_cycles import fake_interpreter
 
+from stages import data_render
 from stages.data_render import (
     SUMMARY,
     DataRequest,
@@ -86,6 +87,28 @@ def test_meshes_and_environments_come_from_folders(request_of, tmp_path):
     assert example.metadata["name"] == "b_good" and example.metadata["quality"] == "low"
     assert "sky turned" in example.metadata["environments"]
     assert json.loads((request.folder / SUMMARY).read_text())["skipped"] == 2
+
+
+def test_a_mesh_that_cannot_be_rendered_is_left_out_and_a_full_disk_is_not(
+    request_of, tmp_path, monkeypatch
+):
+    (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\n")
+    request = replace(request_of, meshes=mesh_files(tmp_path))
+
+    def fail(*_args: object, **_settings: object) -> None:
+        raise RuntimeError("no view shows it")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(data_render, "render_example", fail)
+        (outcome,) = render_data(request, 1, workers=1)
+    assert outcome.status == "skipped" and "one.obj was left out: no view" in outcome.message
+
+    def full(*_args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(data_render, "write_example", full)
+    with pytest.raises(OSError, match="No space"):
+        list(render_data(request, 1, workers=1))
 
 
 def test_empty_and_missing_folders_are_refused(tmp_path):

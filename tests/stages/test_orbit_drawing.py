@@ -6,8 +6,9 @@ import pytest
 import torch
 from drawn_sphere import DISTANCE, drawn_cameras, drawn_sphere, sphere_photo
 from pydantic import ValidationError
-from tiny_model import tiny_model, write_tiny_model
+from tiny_model import TINY, tiny_model, write_tiny_model
 
+from stages import orbit_drawing
 from stages.artifacts import MaterialViews
 from stages.errors import InputError
 from stages.generation import run
@@ -138,6 +139,45 @@ def test_views_without_an_object_are_refused_with_advice(draw, monkeypatch):
         draw()
 
 
+def test_numbers_that_are_none_are_refused_with_advice(draw, monkeypatch):
+    monkeypatch.setattr(
+        MaterialDiffusion, "draw", lambda *_: torch.full((VIEWS, 8, 4, 4), torch.nan)
+    )
+    with pytest.raises(InputError, match=r"not finite; try --set generation.dtype=float32"):
+        draw()
+
+
+def test_a_model_of_colour_alone_is_refused_with_advice(draw, monkeypatch):
+    colour = replace(TINY, groups=("rgb",))
+    alone = MaterialDiffusion(colour, *tiny_model().parts.values())
+    monkeypatch.setattr(orbit_drawing, "read_model", lambda *_: alone)
+    with pytest.raises(InputError, match=r"has rgb alone; convert it with --groups 4"):
+        draw()
+
+
+@pytest.mark.parametrize(
+    ("settings", "grows_by"),
+    [
+        ({}, "index"),
+        ({"path": "list", "angles": [(0, 90), (0, 180), (0, 0)]}, "azimuth"),
+        ({"path": "list", "angles": [(0, 90), (0, 180), (0, 0)], "guidance_by": "index"}, "index"),
+    ],
+)
+def test_guidance_grows_as_the_cameras_ask(make_context, monkeypatch, settings, grows_by):
+    used = []
+    plain = MaterialDiffusion.guidance
+
+    def guidance(self, conditioning, sampling):
+        used.append(sampling.guidance_by)
+        return plain(self, conditioning, sampling)
+
+    monkeypatch.setattr(MaterialDiffusion, "guidance", guidance)
+    config = GenerationConfig(sampler_steps=1, **settings)
+    angles = camera_path(config, VIEWS)
+    draw_samples(tiny_model(), PHOTO, angles, config, make_context("generation"))
+    assert used == [grows_by]
+
+
 def test_contradicting_silhouettes_bring_the_cameras_closer():
     sphere = drawn_sphere(VIEWS, SIZE)
     wide = sphere.mask.clone()
@@ -165,6 +205,7 @@ def test_camera_paths():
         ({"angles": [(0, 90), (0, 180), (0, 0)]}, "path list and angles belong together"),
         ({"path": "list", "angles": [(0, 90), (0, 180), (0, 270)]}, "last stands at azimuth 0"),
         ({"path": "list", "angles": [(0, 90), (0, 0)]}, "at least 3 cameras"),
+        ({"guidance_interval": (5.0, 0.3)}, "a smaller and a larger noise level"),
         ({"samples": 0}, "greater than or equal to 1"),
     ],
 )

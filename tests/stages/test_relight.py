@@ -194,6 +194,12 @@ def test_wishes_that_cannot_be_met_are_refused(orbit, ctx, change, said):
         run(orbit, config=STILL.model_copy(update=change), ctx=ctx)
 
 
+def test_a_photo_is_refused_with_advice(ctx, tmp_path):
+    (tmp_path / "cat.png").write_bytes(b"never read")
+    with pytest.raises(InputError, match=r"cat.png is a picture, .* svim3d run cat.png"):
+        run(tmp_path / "cat.png", config=STILL, ctx=ctx)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
