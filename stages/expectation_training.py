@@ -103,11 +103,13 @@ def _errors(
     seen = draw_seen(clips, config.batch, generator)
     keep = (torch.rand(config.batch, generator=generator) >= config.drop_share).float()
     latents = _stacked(seen, "latents", ctx) * model.spec.latent_scale
-    reference = _stacked(seen, "reference", ctx) * keep.view(-1, 1, 1, 1).to(ctx.device)
+    keep = keep.view(-1, 1, 1, 1).to(ctx.device)
+    reference = _stacked(seen, "reference", ctx) * keep
+    picture = _stacked(seen, "picture", ctx) * keep
     camera = torch.stack([one.camera(model.spec) for one in seen]).to(ctx.device)
     use_bfloat16 = config.precision == "bfloat16"
     with torch.autocast(ctx.device.type, torch.bfloat16, enabled=use_bfloat16):
-        answer = expectation(reference, camera)
+        answer = expectation(reference, picture, camera)
     squares = (answer.float() - latents) ** 2
     good = torch.tensor([one.clip.has_good_materials for one in seen], device=ctx.device)
     return squares.unflatten(2, (len(GROUPS), -1)).mean((1, 3, 4, 5)), good

@@ -188,6 +188,7 @@ def draw_clips(
             token=torch.cat([_token(one, model, config, ctx) for one in seen]),
             latent=torch.stack([one.reference for one in seen]).to(ctx.device),
             camera=torch.stack([one.camera(model.spec) for one in seen]).to(ctx.device),
+            picture=torch.stack([one.picture for one in seen]).to(ctx.device),
         ),
         has_good_materials=torch.tensor(
             [one.clip.has_good_materials for one in seen], device=ctx.device
@@ -199,12 +200,10 @@ def _token(
     seen: SeenClip, model: MaterialDiffusion, config: GeneratorTrainingConfig, ctx: Context
 ) -> Float[Tensor, "1 1 d"]:
     """The embedding of the reference view: as stored, unless the image encoder learns."""
-    clip, frame = seen.clip, int(seen.order[-1])
-    if clip.tokens is not None:
-        return clip.tokens[seen.light, frame].float().to(ctx.device)[None, None]
-    shown = clip.pictures[seen.light, frame][None].to(ctx.device).float() / 127.5 - 1.0
+    if seen.clip.tokens is not None:
+        return seen.clip.tokens[seen.light, seen.order[-1]].float().to(ctx.device)[None, None]
     with _autocast(config, ctx):
-        return embed_picture(model.image_encoder, shown).float()
+        return embed_picture(model.image_encoder, seen.picture[None].to(ctx.device)).float()
 
 
 def _step(

@@ -58,6 +58,11 @@ class SeenClip:
         """Latent of the reference view, not scaled."""
         return self.clip.rgb[self.light, self.order[-1]].float()
 
+    @property
+    def picture(self) -> Float[Tensor, "3 t t"]:
+        """The reference view as the image encoder sees it."""
+        return self.clip.pictures[self.light, self.order[-1]].float() / 127.5 - 1.0
+
     def camera(self, spec: ModelSpec) -> Float[Tensor, "k 3"]:
         """What the model is told of the cameras."""
         elevation, azimuth = self.clip.elevation_deg[self.form], self.clip.azimuth_deg[self.form]

@@ -37,6 +37,7 @@ def draw_generator_sheet(
             token=embed_picture(model.image_encoder, shown[None]).detach(),
             latent=truth[0, -1][None].to(model.device),
             camera=camera[None],
+            picture=shown[None],
         )
         drawn = (
             model.draw(conditioning, seed, Sampling(steps=STEPS)).cpu() / model.spec.latent_scale

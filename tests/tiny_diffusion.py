@@ -94,6 +94,7 @@ def some_conditioning(clips: int = 1, seed: int = 0) -> Conditioning:
         token=torch.randn(clips, 1, 16, generator=generator),
         latent=torch.randn(clips, GROUP_CHANNELS, SIDE, SIDE, generator=generator),
         camera=camera_numbers(elevation, azimuth.expand(clips, -1), 1e-5),
+        picture=torch.rand(clips, 3, SIDE, SIDE, generator=generator),
     )
 
 

@@ -23,12 +23,14 @@ class Conditioning:
         token: the reference view as a whole.
         latent: the reference view's latent, not scaled as the noisy latents are.
         camera: of each frame, see `camera_numbers`.
+        picture: the reference view at the image encoder's size, in [-1, 1]; for an `Expectation`.
         expected: mean of all groups' latents, from a model that has an `Expectation`.
     """
 
     token: Float[Tensor, "b 1 d"]
     latent: Float[Tensor, "b z h w"]
     camera: Float[Tensor, "b k 3"]
+    picture: Float[Tensor, "b 3 t t"] | None = None
     expected: Float[Tensor, "b k c h w"] | None = None
 
     def dropped(self, drop: Float[Tensor, "b"]) -> Self:
@@ -41,6 +43,9 @@ class Conditioning:
             token=self.token * keep.view(-1, 1, 1).to(self.token),
             latent=self.latent * keep.view(-1, 1, 1, 1).to(self.latent),
             camera=self.camera,
+            picture=None
+            if self.picture is None
+            else self.picture * keep.view(-1, 1, 1, 1).to(self.picture),
         )
 
     def beside_unconditional(self) -> Self:
@@ -50,6 +55,9 @@ class Conditioning:
             token=torch.cat([nothing.token, self.token]),
             latent=torch.cat([nothing.latent, self.latent]),
             camera=torch.cat([self.camera, self.camera]),
+            picture=None
+            if nothing.picture is None or self.picture is None
+            else torch.cat([nothing.picture, self.picture]),
         )
 
     @property

@@ -11,6 +11,7 @@ Modeling for Km-scale Atmospheric Downscaling" (CorrDiff), section 3.
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 ELEVATION_TERMS = 3  # 1, cos and sin of the azimuth, times the climb from the reference view
 POSITION_SPREAD = 0.02  # standard deviation of fresh position embeddings, as in BERT and ViT
@@ -22,6 +23,7 @@ class Expectation(nn.Module):
     Args:
         latent_channels: of one group.
         side: of a latent picture.
+        picture_side: of the reference view as the image encoder sees it; a multiple of `side`.
         groups: how many.
         width: of the transformer.
         layers: of the transformer.
@@ -34,6 +36,7 @@ class Expectation(nn.Module):
         *,
         latent_channels: int,
         side: int,
+        picture_side: int,
         groups: int,
         width: int,
         layers: int,
@@ -42,8 +45,11 @@ class Expectation(nn.Module):
     ) -> None:
         super().__init__()
         self.harmonics = harmonics
+        self.pixels_per_cell = picture_side // side
         self.channels = groups * latent_channels
         self.cell = nn.Linear(latent_channels, width)
+        # Highlights, which tell gloss from metal, are finer than latents of a small autoencoder.
+        self.pixels = nn.Linear(3 * self.pixels_per_cell**2, width)
         self.position = nn.Parameter(POSITION_SPREAD * torch.randn(side * side, width))
         self.height = nn.Linear(2, width)
         layer = nn.TransformerEncoderLayer(
@@ -64,17 +70,23 @@ class Expectation(nn.Module):
         nn.init.zeros_(self.head.bias)
 
     def forward(
-        self, latent: Float[Tensor, "b z h w"], camera: Float[Tensor, "b k 3"]
+        self,
+        latent: Float[Tensor, "b z h w"],
+        picture: Float[Tensor, "b 3 t t"],
+        camera: Float[Tensor, "b k 3"],
     ) -> Float[Tensor, "b k c h w"]:
         """The mean of each frame; without a reference view (zeros), that of all objects.
 
         Args:
             latent: the reference view's, as in `Conditioning`.
+            picture: the reference view, as in `Conditioning`.
             camera: of each frame, as in `Conditioning`; the last is the reference view's.
         """
         polar = camera[:, -1:, 1]
         height = self.height(torch.cat([polar.cos(), polar.sin()], -1))[:, None]
-        cells = self.cell(latent.flatten(2).transpose(1, 2)) + self.position + height
+        pixels = functional.pixel_unshuffle(picture, self.pixels_per_cell)
+        seen = self.cell(_cells(latent)) + self.pixels(_cells(pixels))
+        cells = seen + self.position + height
         series = self.head(self.body(cells)).to(camera)
         series = series.unflatten(-1, (-1, self.channels))
         frames = torch.einsum("bkn,bpnc->bkcp", self.turn(camera), series)
@@ -88,3 +100,8 @@ class Expectation(nn.Module):
             waves += [(order * azimuth).cos(), (order * azimuth).sin()]
         climb = polar[:, -1:] - polar
         return torch.stack([*waves, climb, climb * azimuth.cos(), climb * azimuth.sin()], -1)
+
+
+def _cells(picture: Float[Tensor, "b c h w"]) -> Float[Tensor, "b h_w c"]:
+    """A picture's cells, row by row."""
+    return picture.flatten(2).transpose(1, 2)

@@ -45,13 +45,20 @@ class GeneratedViews:
     mask: Float[Tensor, "K H W 1"]
 
 
-def unpack(pictures: dict[str, Float[Tensor, "K 3 H W"]]) -> GeneratedViews:
-    """Views from the four decoded pictures, each in [-1, 1], over white and black."""
+def unpack(
+    pictures: dict[str, Float[Tensor, "K 3 H W"]], normal_length: float = 1.0
+) -> GeneratedViews:
+    """Views from the four decoded pictures, each in [-1, 1], over white and black.
+
+    Args:
+        pictures: by group.
+        normal_length: of decoded normals, see `coverage`.
+    """
     planes = {
         name: ((picture.permute(0, 2, 3, 1) + 1.0) / 2.0).clamp(0.0, 1.0)
         for name, picture in pictures.items()
     }
-    shown = coverage(planes["normal"])
+    shown = coverage(planes["normal"], normal_length)
     mask = sharpen(shown)
     seen = (mask > 0.0).to(mask)
     # What is nearly full is taken for full; a rim is divided by the share that it was mixed by.
@@ -68,16 +75,23 @@ def unpack(pictures: dict[str, Float[Tensor, "K 3 H W"]]) -> GeneratedViews:
     )
 
 
-def coverage(normal: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 1"]:
+def coverage(normal: Float[Tensor, "*b 3"], length: float = 1.0) -> Float[Tensor, "*b 1"]:
     """Share of a pixel that an encoded normal over black covers.
 
-    A pixel p = m (n + 1) / 2 with a unit n gives |2 p - m 1| = m, that is
-    m^2 - 2 m sum(p) + 2 |p|^2 = 0, whose smaller root is the coverage, unless n.x + n.y + n.z < -1:
-    normals that point far down and to the left, which only faces seen at a grazing angle have.
+    A pixel p = m (n + 1) / 2 with |n| = l gives |2 p - m 1| = l m, that is
+    (3 - l^2) m^2 / 2 - 2 m sum(p) + 2 |p|^2 = 0, whose smaller root is the coverage, unless, for
+    l = 1, n.x + n.y + n.z < -1: normals that point far down and to the left, which only faces seen
+    at a grazing angle have.
+
+    Args:
+        normal: pixels in [0, 1].
+        length: of the normals: 1, or less where a model's answer is a mean of several.
     """
     total = normal.sum(-1, keepdim=True)
     squares = (normal**2).sum(-1, keepdim=True)
-    return (total - (total**2 - 2.0 * squares).clamp(min=0.0).sqrt()).clamp(0.0, 1.0)
+    lead = (3.0 - length**2) / 2.0
+    root = (total**2 - 2.0 * lead * squares).clamp(min=0.0).sqrt()
+    return ((total - root) / lead).clamp(0.0, 1.0)
 
 
 def sharpen(mask: Float[Tensor, "*b 1"]) -> Float[Tensor, "*b 1"]:

@@ -22,6 +22,7 @@ from svim3d.diffusion.conditioning import (
     Shrinking,
     camera_numbers,
     embed_picture,
+    shrink_picture,
 )
 from svim3d.diffusion.expectation import Expectation
 from svim3d.diffusion.groups import GROUPS, GeneratedViews, as_network_input, unpack
@@ -62,6 +63,8 @@ class ModelSpec:
         expectation: arguments of `Expectation` beyond those that follow from the others; None for a
             model that diffuses latents themselves.
         residual_scale: what an expectation leaves open, as a standard deviation of latents.
+        normal_length: of the normals it decodes inside an object; a model that hesitates answers
+            with means of directions, which are shorter than 1.
     """
 
     name: str
@@ -83,6 +86,7 @@ class ModelSpec:
     groups: tuple[str, ...] = field(default=GROUPS)
     expectation: dict[str, Any] | None = None
     residual_scale: float = 1.0
+    normal_length: float = 1.0
 
     @property
     def latent_side(self) -> int:
@@ -198,6 +202,7 @@ class MaterialDiffusion:
             else Expectation(
                 latent_channels=spec.latent_channels,
                 side=spec.latent_side,
+                picture_side=int(spec.image_encoder["image_size"]),
                 groups=len(spec.groups),
                 **spec.expectation,
             ),
@@ -244,10 +249,12 @@ class MaterialDiffusion:
                 pictures, size=(side, side), mode="bicubic", align_corners=False, antialias=True
             ).clamp(-1.0, 1.0)
         camera = camera_numbers(elevation_deg, azimuth_deg, self.spec.cond_aug)
+        small = shrink_picture(pictures, self.image_encoder.config.image_size, self.spec.shrink)
         return Conditioning(
-            token=embed_picture(self.image_encoder, pictures, self.spec.shrink).float(),
+            token=embed_picture(self.image_encoder, small).float(),
             latent=encode(self.autoencoder, pictures),
             camera=camera[None].to(self.device, torch.float32),
+            picture=small,
         )
 
     @torch.no_grad()
@@ -313,8 +320,11 @@ class MaterialDiffusion:
         """The same, with what the model expects of it, if it is one that does."""
         if self.expectation is None:
             return conditioning
+        assert conditioning.picture is not None
         weights = self.expectation.position.dtype
-        expected = self.expectation(conditioning.latent.to(weights), conditioning.camera)
+        expected = self.expectation(
+            conditioning.latent.to(weights), conditioning.picture.to(weights), conditioning.camera
+        )
         return replace(conditioning, expected=expected)
 
     def residual(
@@ -364,7 +374,8 @@ class MaterialDiffusion:
         groups = latents.split(self.spec.latent_channels, 1)
         stacked = torch.cat(groups) / self.spec.latent_scale
         pictures = decode(self.autoencoder, stacked, sampling.decode_at_once).chunk(len(groups))
-        return unpack(dict(zip(self.spec.groups, pictures, strict=True)))
+        named = dict(zip(self.spec.groups, pictures, strict=True))
+        return unpack(named, self.spec.normal_length)
 
     def guidance(self, conditioning: Conditioning, sampling: Sampling) -> Float[Tensor, "K"]:
         """Strength of guidance at each frame."""

@@ -60,6 +60,7 @@ def test_it_learns_what_follows_from_the_reference_view(tmp_path):
             token=torch.zeros(1, 1, 16),
             latent=unseen.rgb[0, -1][None].float(),
             camera=camera_numbers(unseen.elevation_deg, unseen.azimuth_deg, 1e-5),
+            picture=torch.full((1, 3, 16, 16), -1.0),  # of no colour, as in training
         )
     )
     truth = torch.cat([unseen.rgb, unseen.materials[0]]).float().transpose(0, 1).flatten(1, 2)

@@ -9,6 +9,8 @@ from tiny_diffusion import FRAMES, GROUP_CHANNELS, SIDE, some_conditioning, stir
 from svim3d.diffusion.conditioning import camera_numbers
 from svim3d.diffusion.expectation import Expectation
 
+PICTURE = torch.rand(1, 3, 2 * SIDE, 2 * SIDE, generator=torch.Generator().manual_seed(5))
+
 
 def tiny_expectation(harmonics: int = 2) -> Expectation:
     with torch.random.fork_rng():
@@ -16,6 +18,7 @@ def tiny_expectation(harmonics: int = 2) -> Expectation:
         made = Expectation(
             latent_channels=GROUP_CHANNELS,
             side=SIDE,
+            picture_side=2 * SIDE,
             groups=4,
             width=16,
             layers=1,
@@ -33,7 +36,7 @@ def stirred() -> Expectation:
 
 def test_a_fresh_one_expects_nothing():
     told = some_conditioning()
-    frames = tiny_expectation()(told.latent, told.camera)
+    frames = tiny_expectation()(told.latent, PICTURE, told.camera)
     assert frames.shape == (1, FRAMES, 4 * GROUP_CHANNELS, SIDE, SIDE)
     assert not frames.any()
 
@@ -45,7 +48,7 @@ def test_frames_are_a_fourier_series_of_the_azimuth():
     def level_orbit(azimuths: list[float]) -> torch.Tensor:
         azimuth = torch.tensor([azimuths])
         camera = camera_numbers(torch.full_like(azimuth, 20.0), azimuth, 1e-5)
-        return model(told.latent, camera)[0].double()
+        return model(told.latent, PICTURE, camera)[0].double()
 
     terms = [360.0 * step / 5 for step in (1, 2, 3, 4, 0)]  # 1, cos, sin, cos 2, sin 2
     known, asked = level_orbit(terms), level_orbit([33.0, 190.0, 0.0])
@@ -62,7 +65,8 @@ def test_climbing_from_the_reference_view_matters_and_standing_above_it_too():
     azimuth = torch.tensor([[90.0, 180.0, 0.0]])
 
     def seen(*elevation: float) -> torch.Tensor:
-        return model(told.latent, camera_numbers(torch.tensor([elevation]), azimuth, 1e-5))
+        camera = camera_numbers(torch.tensor([elevation]), azimuth, 1e-5)
+        return model(told.latent, PICTURE, camera)
 
     level, climbing, above = seen(0.0, 0.0, 0.0), seen(30.0, 0.0, 0.0), seen(30.0, 30.0, 30.0)
     assert not torch.allclose(level[:, 0], climbing[:, 0], atol=1e-3)
@@ -72,14 +76,17 @@ def test_climbing_from_the_reference_view_matters_and_standing_above_it_too():
 
 def test_every_cell_of_the_reference_view_is_seen_by_every_cell():
     model, told = stirred(), some_conditioning()
-    changed = told.latent.clone()
-    changed[..., 0, 0] += 1.0
-    moved = (model(changed, told.camera) - model(told.latent, told.camera)).abs().amax((0, 1, 2))
-    assert bool((moved > 0.0).all())
+    latent, picture = told.latent.clone(), PICTURE.clone()
+    latent[..., 0, 0] += 1.0
+    picture[..., 0, 0] += 1.0
+    plain = model(told.latent, PICTURE, told.camera)
+    for one, other in ((latent, PICTURE), (told.latent, picture)):
+        moved = (model(one, other, told.camera) - plain).abs().amax((0, 1, 2))
+        assert bool((moved > 0.0).all())
 
 
 @pytest.mark.parametrize("side", [SIDE // 2, SIDE * 2])
 def test_latents_of_another_side_are_refused(side):
     told = some_conditioning()
     with pytest.raises(RuntimeError):
-        stirred()(torch.zeros(1, GROUP_CHANNELS, side, side), told.camera)
+        stirred()(torch.zeros(1, GROUP_CHANNELS, side, side), PICTURE, told.camera)

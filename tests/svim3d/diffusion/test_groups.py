@@ -46,9 +46,11 @@ def test_materials_come_back_at_every_coverage(covered):
 
 
 @pytest.mark.parametrize("covered", [0.05, 0.3, 0.8, 1.0])
-def test_coverage_is_read_off_the_normals(covered):
-    _, pictures = packed(covered)
-    found = coverage((pictures["normal"].movedim(1, -1) + 1.0) / 2.0)
+@pytest.mark.parametrize("length", [1.0, 0.8])
+def test_coverage_is_read_off_the_normals(covered, length):
+    straight, _ = packed(1.0)
+    pixels = covered * (length * straight["normal"] + 1.0) / 2.0
+    found = coverage(pixels, length)
     torch.testing.assert_close(found, torch.full_like(found, covered), atol=1e-4, rtol=0.0)
 
 

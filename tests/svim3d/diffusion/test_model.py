@@ -109,7 +109,7 @@ def test_the_network_draws_what_the_expectation_leaves_open():
     model = tiny_model(EXPECTING)
     told = model.condition(a_picture(), *PATH.tensors())
     noisy, sigma, scale = torch.randn(1, FRAMES, 16, 8, 8), 3.0, EXPECTING.residual_scale
-    expected = model.expectation(told.latent, told.camera)
+    expected = model.expectation(told.latent, told.picture, told.camera)
     unscaled = MaterialDiffusion(SPEC, *list(model.parts.values())[:3])
     seeing = replace(told, expected=expected)
     shifted = expected + (noisy - expected) / scale
