@@ -208,6 +208,11 @@ def _entries(archive: Path) -> Iterator[tuple[tarfile.TarInfo, IO[bytes]]]:
                     "sparse files are not taken"
                 )
             yield entry, stream
+        # The reader takes a tar that was cut between two files for a whole one.
+        with archive.open("rb") as whole:
+            whole.seek(tar.offset)
+            if whole.read(tarfile.BLOCKSIZE) != bytes(tarfile.BLOCKSIZE):
+                raise tarfile.ReadError("its end is missing; copy it again")
 
 
 def _place(archive: Path, name: str) -> tuple[str, str]:

@@ -66,7 +66,8 @@ def collect_garbage(
                 "try again in a moment"
             )
         removed = []
-        for removal, lock in _candidates(store, needed(), older_than_s):
+        # Listed as a whole first: what is thrown away now is no leftover of an earlier cleaning.
+        for removal, lock in list(_candidates(store, needed(), older_than_s)):
             with file_lock(lock) if lock else contextlib.nullcontext(True) as is_free:
                 if is_free and _throw_away(store, removal.path):
                     removed.append(removal)
