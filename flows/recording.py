@@ -14,10 +14,14 @@ from flows.plan import Plan, Step, Verdict
 from flows.processes import Process
 from flows.run_folder import replace_file
 from flows.run_records import (
+    CACHED,
     CANCELLED,
+    COMPUTED,
+    COMPUTING,
     DONE,
     FAILED,
     RUNNING,
+    WAITING,
     RunIndex,
     RunRecord,
     StageRecord,
@@ -39,7 +43,6 @@ RECORD_COPY, LOG_COPY = "record.json", "run.log"
 WRITE_EVERY_S = 2.0  # while a stage counts its steps
 LOG_FORMAT = "%(asctime)s %(levelname)-7s %(stage)-10s %(message)s"
 LOG_TIME = "%Y-%m-%dT%H:%M:%S%z"
-WAITING, COMPUTING = "waiting", "computing"
 
 
 class RunRecorder:
@@ -168,7 +171,7 @@ class RunRecorder:
     def finished(self, step: Step, stored: Stored) -> None:
         """A stage's artifact is in the store."""
         name, record = step.node.name, stored.manifest.record
-        state = "cached" if stored.is_cached else "computed"
+        state = CACHED if stored.is_cached else COMPUTED
         seconds = None if stored.is_cached else record.get("seconds")
         self._change(stage=name, step=0, total=0, **self._stage(name, state=state, seconds=seconds))
         log.info("%s %s: %s", state, step.key8, record.get("headline", ""))
@@ -214,7 +217,7 @@ class Audience:
 
 def _planned(step: Step) -> StageRecord:
     """A stage before the run."""
-    states = {Verdict.CACHED: "cached", Verdict.COMPUTE: WAITING}
+    states = {Verdict.CACHED: CACHED, Verdict.COMPUTE: WAITING}
     is_wanted = step.verdict in states
     key = step.recipe.key if step.recipe and is_wanted else None
     return StageRecord(key, states.get(step.verdict, str(step.verdict)))

@@ -23,6 +23,7 @@ from stages.errors import InputError
 
 RUNNING, DONE, FAILED, CANCELLED, DIED = "running", "done", "failed", "cancelled", "died"
 UNFINISHED = (FAILED, CANCELLED, DIED)
+WAITING, COMPUTING, COMPUTED, CACHED = "waiting", "computing", "computed", "cached"  # of stages
 # A run on a machine that cannot be asked counts as ended when it gave no sign for this long.
 SILENT_S = 3600.0
 MAX_NAME = 40
@@ -224,9 +225,9 @@ class RunIndex:
 
 
 def new_id(name: str) -> str:
-    """A readable name that no other run has."""
+    """A short name that no other run has."""
     plain = re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:MAX_NAME] or "run"
-    return f"{plain}-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
+    return f"{plain}-{secrets.token_hex(4)}"
 
 
 def newest_of_folders(records: Iterable[RunRecord]) -> list[RunRecord]:

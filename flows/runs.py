@@ -15,7 +15,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.run_records import (
+    CACHED,
     CANCELLED,
+    COMPUTED,
+    COMPUTING,
     DIED,
     FAILED,
     RUNNING,
@@ -33,11 +36,18 @@ SHOWN_RUNS = 40  # in a table, without --all
 STYLES = {RUNNING: "cyan", "done": "green", FAILED: "red", DIED: "red", CANCELLED: "yellow"}
 STOP_TIMEOUT_S = 20.0  # for a run to leave its state behind
 FOLLOW_POLL_S = 0.5
+FILE_WIDTH = 250  # columns of a table that goes into a file: scripts must get whole names
+
+
+def table_console() -> Console:
+    """Where tables are printed: as wide as the terminal, or as they need in a file."""
+    console = Console()
+    return console if console.is_terminal else Console(width=FILE_WIDTH)
 
 
 def status(options: argparse.Namespace) -> int:
     """Tell of one run, or print a table of them."""
-    index, console = RunIndex(options.store), Console()
+    index, console = RunIndex(options.store), table_console()
     if options.run is not None:
         _tell(index.find(options.run), index, console)
         return EXIT_DONE
@@ -64,8 +74,7 @@ def status(options: argparse.Namespace) -> int:
             in_short(time.time() - record.started),
             in_short(record.duration_s),
         )
-    # As wide as it needs where the output is a file: scripts must get whole names.
-    console.print(table, soft_wrap=not console.is_terminal)
+    console.print(table)
     counts = ", ".join(f"{n} {state}" for state, n in Counter(states.values()).most_common())
     hidden = f"; the newest {len(shown)} are shown, --all shows all" if shown != records else ""
     console.print(f"{len(records)} runs: {counts}{hidden}", highlight=False)
@@ -98,14 +107,17 @@ def _tell(record: RunRecord, index: RunIndex, console: Console) -> None:
     stages.add_column("seconds", justify="right")
     for name, stage in record.stages.items():
         seconds = "" if stage.seconds is None else f"{stage.seconds:.1f}"
-        stages.add_row(escape(name), escape(stage.state), escape((stage.key or "")[:8]), seconds)
+        became = "stopped" if stage.state == COMPUTING and state != RUNNING else stage.state
+        stages.add_row(escape(name), escape(became), escape((stage.key or "")[:8]), seconds)
     console.print(stages)
+    if state in UNFINISHED and record.command:
+        console.print(f"svim3d resume {record.id} goes on where it stopped", highlight=False)
 
 
 def progress_of(record: RunRecord) -> str:
     """Stages that are there of those that are wanted, and the steps of the one at work."""
     wanted = [stage for stage in record.stages.values() if stage.key]
-    there = sum(stage.state in ("cached", "computed") for stage in wanted)
+    there = sum(stage.state in (CACHED, COMPUTED) for stage in wanted)
     steps = f", {record.step}/{record.total}" if record.total else ""
     return f"{there}/{len(wanted)}{steps}"
 

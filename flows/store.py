@@ -13,7 +13,7 @@ from rich.progress import track
 from rich.table import Table
 
 from flows.run_records import RunIndex, RunRecord, worth_keeping
-from flows.runs import in_short
+from flows.runs import in_short, table_console
 from stages.manifest import Manifest
 from stages.store import Store
 from stages.store_archive import RUN_LOG, RUN_PAGE, export_artifacts, import_artifacts
@@ -31,7 +31,7 @@ def store(options: argparse.Namespace) -> int:
 
 def ls(options: argparse.Namespace) -> int:
     """List artifacts, the newest first, and what each stage takes up."""
-    console = Console()
+    console = table_console()
     found = list(_dated(Store(options.store)))
     shown = found if options.all else found[:SHOWN]
     table = Table("key", "stage", box=None, pad_edge=False)

@@ -10,6 +10,7 @@ replaces at this moment is locked, and stays.
 import contextlib
 import os
 import shutil
+import stat
 import time
 from collections.abc import Callable, Iterator, Set
 from dataclasses import dataclass
@@ -133,10 +134,11 @@ def _removal(kind: str, path: Path) -> Removal:
 
 def _statuses(path: Path) -> Iterator[os.stat_result]:
     """Of a file, or of all files below a folder, as far as they are still there."""
-    for folder, _, names in os.walk(path) if path.is_dir() else [(path.parent, [], [path.name])]:
-        for name in names:
-            with contextlib.suppress(FileNotFoundError):
-                yield (Path(folder) / name).lstat()
+    for file in path.rglob("*") if path.is_dir() else [path]:
+        with contextlib.suppress(FileNotFoundError):
+            status = file.lstat()
+            if not stat.S_ISDIR(status.st_mode):
+                yield status
 
 
 def _changed_s(path: Path) -> float:
