@@ -180,6 +180,10 @@ class RunIndex:
         partial.write_bytes(record.as_bytes())
         partial.replace(self.page(record.id))
 
+    def read(self, run: str) -> RunRecord:
+        """The page of a run that is there."""
+        return RunRecord.parse(self.page(run).read_bytes())
+
     def forget(self, run: str) -> None:
         """Remove a run's page and log."""
         self.page(run).unlink(missing_ok=True)

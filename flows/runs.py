@@ -198,7 +198,7 @@ def logs(options: argparse.Namespace) -> int:
     with file.open(encoding="utf-8", errors="replace") as stream:
         while True:
             # Asked first: what a run writes last is there once it is over.
-            goes_on = options.follow and index.find(record.id).now == RUNNING
+            goes_on = options.follow and index.read(record.id).now == RUNNING
             for line in stream:
                 sys.stdout.write(line)
             sys.stdout.flush()

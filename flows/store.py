@@ -113,7 +113,7 @@ def gc(options: argparse.Namespace) -> int:
     )
     for removal in removed if options.dry_run else ():
         console.print(
-            f"{removal.kind:12} {_mib(removal.size):>10} MiB  {removal.path.name}",
+            f"{removal.kind:20} {_mib(removal.size):>10} MiB  {removal.path.name}",
             highlight=False,
             markup=False,
             soft_wrap=True,
@@ -127,8 +127,8 @@ def gc(options: argparse.Namespace) -> int:
     for record in forgotten if not options.dry_run else ():
         index.forget(record.id)
     kinds = Counter(removal.kind for removal in removed)
-    kinds["page of a run"] = len(forgotten)
-    counts = ", ".join(f"{number} {kind}" for kind, number in kinds.items() if number)
+    kinds["run page"] = len(forgotten)
+    counts = ", ".join(f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in kinds.items() if n)
     size = sum(removal.size for removal in removed)
     would = "would be " if options.dry_run else ""
     console.print(

@@ -31,7 +31,7 @@ class Removal:
     """Something that goes, or would go.
 
     Attributes:
-        kind: what it is: "artifact", "unfinished", "quarantined" or "temporary".
+        kind: what it is: "artifact", "unfinished stage", "quarantined artifact" or "leftover".
         path: where it lies.
         size: bytes of all its files.
     """
@@ -89,15 +89,15 @@ def _candidates(
         # Work beside a published artifact was left by a kill, or by a recomputation that failed.
         is_needed = entry.name in needed and not (root / "obj" / entry.name).exists()
         if not is_needed and now - _latest_s(entry) > older_than_s:
-            yield _removal("unfinished", entry), root / "lock" / entry.name
+            yield _removal("unfinished stage", entry), root / "lock" / entry.name
     for entry in _entries(root / "bad"):
         if now - _quarantined_s(entry) > older_than_s:
-            yield _removal("quarantined", entry), None
+            yield _removal("quarantined artifact", entry), None
     for entry in _entries(root / TRASH):
-        yield _removal("temporary", entry), None
+        yield _removal("leftover", entry), None
     for entry in _temporaries(root):
         if now - _latest_s(entry) > TEMPORARY_S:
-            yield _removal("temporary", entry), None
+            yield _removal("leftover", entry), None
 
 
 def _held(lock: Path | None) -> bool:

@@ -297,12 +297,12 @@ def test_gc_keeps_what_the_newest_runs_and_those_at_work_need(svim3d, store, ind
     assert {line.split()[-1] for line in told.splitlines()[:-1]} == gone
     size = sum(size for k in gone for n, (size, _) in files_of(store, k).items())
     assert told.splitlines()[-1] == (
-        f"0.0 MiB would be removed ({size} bytes): 2 artifact, 1 page of a run"
+        f"0.0 MiB would be removed ({size} bytes): 2 artifacts, 1 run page"
     )
     assert len(store.keys()) == 5 and index.page(old.id).exists()
 
     code, told = svim3d("store", "gc", "--keep-last", 2)
-    assert code == cli.DONE and f"removed ({size} bytes): 2 artifact" in told
+    assert code == cli.DONE and f"removed ({size} bytes): 2 artifacts" in told
     assert set(store.keys()) == set(keys) - gone
     # Pages of the last days stay, whatever became of their artifacts.
     assert not index.page(old.id).exists() and index.log(page(0).id).exists()

@@ -51,6 +51,15 @@ def test_artifact_that_some_process_holds_stays(store):
     assert clean(store) == [("artifact", key)]
 
 
+def test_half_done_work_that_some_process_holds_stays(store):
+    key = recipe_of(0).key
+    store.work(key).mkdir(parents=True)
+    make_old(store.work(key), days=99)
+    with file_lock(store.root / "lock" / key):
+        assert clean(store) == clean(store, dry_run=True) == []
+    assert clean(store) == [("unfinished stage", key)]
+
+
 def test_half_done_work_goes_when_it_is_old_and_no_run_wants_it(store):
     fresh, wanted, given_up, published = (recipe_of(number).key for number in range(4))
     publish(store, 3)
@@ -59,7 +68,7 @@ def test_half_done_work_goes_when_it_is_old_and_no_run_wants_it(store):
         (store.work(key) / "checkpoint").write_bytes(b"step 7")
         make_old(store.work(key), days=0 if key == fresh else 40)
     gone = clean(store, wanted, published)
-    assert sorted(gone) == sorted([("unfinished", given_up), ("unfinished", published)])
+    assert sorted(gone) == sorted([("unfinished stage", given_up), ("unfinished stage", published)])
     assert store.work(fresh).exists() and store.work(wanted).exists()
     assert store.check(published).state == "ok"
 
@@ -86,7 +95,7 @@ def test_quarantine_counts_from_the_day_it_was_set_aside(store):
         moment = time.time_ns() - int(days * DAY_S * 1e9)
         entry.rename(entry.with_name(f"{key}.{moment}"))
     ((kind, name),) = clean(store)
-    assert kind == "quarantined" and name.startswith(recipe_of(40).key)
+    assert kind == "quarantined artifact" and name.startswith(recipe_of(40).key)
 
 
 def test_temporaries_of_killed_writers_go_after_a_day(store):
@@ -101,7 +110,7 @@ def test_temporaries_of_killed_writers_go_after_a_day(store):
     assert clean(store) == []
     for name in ("shared", "runs", "incoming"):
         make_old(store.root / name, days=1.1)
-    assert [kind for kind, _ in clean(store)] == ["temporary"] * 3
+    assert [kind for kind, _ in clean(store)] == ["leftover"] * 3
     assert operator.exists()
     assert not any((store.root / name).exists() for name in names)
 
