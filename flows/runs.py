@@ -58,7 +58,9 @@ def status(options: argparse.Namespace) -> int:
     states = {record.id: record.now for record in records}
     shown = records if options.all else records[:SHOWN_RUNS]
     table = Table(box=None, pad_edge=False)
-    for column in ("run", "asset", "preset", "state", "stage", "progress"):
+    # Where a terminal is too narrow, names that nobody types are cut.
+    table.add_column("run", no_wrap=True, min_width=max(len(record.id) for record in shown))
+    for column in ("asset", "preset", "state", "stage", "progress"):
         table.add_column(column, no_wrap=True)
     for column in ("age", "took"):
         table.add_column(column, justify="right", no_wrap=True)

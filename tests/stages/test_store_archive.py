@@ -1,6 +1,7 @@
 """Archives carry artifacts whole, and nothing of a foreign one is believed."""
 
 import io
+import random
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
@@ -243,3 +244,27 @@ def test_nothing_is_copied_while_the_store_is_cleaned(store, other, archive, tmp
     ):
         with file_lock(one.root / LEASE), pytest.raises(TransientError, match="being cleaned"):
             copy()
+
+
+def test_any_changed_byte_is_refused_or_makes_no_difference_to_artifacts(store, archive, tmp_path):
+    whole = archive.read_bytes()
+    dice = random.Random(5)
+    outcomes = set()
+    for turn in range(100):
+        place = dice.randrange(len(whole.rstrip(b"\0")))
+        changed = bytearray(whole)
+        changed[place] ^= 1 << dice.randrange(8)
+        archive.write_bytes(changed)
+        other = Store(tmp_path / "others" / str(turn), say=lambda _: None)
+        try:
+            take(other, archive)
+        except InputError:
+            assert other.keys() == []
+            outcomes.add("refused")
+            continue
+        assert other.keys() == store.keys()
+        for key in store.keys():  # noqa: SIM118
+            assert Store(other.root).check(key).state == "ok"
+        outcomes.add("taken")
+    assert outcomes == {"refused", "taken"}
+    assert {path.name for path in tmp_path.iterdir()} == {"store", "others", "run.tar"}
