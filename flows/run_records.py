@@ -26,7 +26,7 @@ UNFINISHED = (FAILED, CANCELLED, DIED)
 WAITING, COMPUTING, COMPUTED, CACHED = "waiting", "computing", "computed", "cached"  # of stages
 # A run on a machine that cannot be asked counts as ended when it gave no sign for this long.
 SILENT_S = 3600.0
-MAX_NAME = 40
+MAX_NAME = 20  # of the folder's name in an id
 ID = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 
 

@@ -59,9 +59,9 @@ def status(options: argparse.Namespace) -> int:
     shown = records if options.all else records[:SHOWN_RUNS]
     table = Table(box=None, pad_edge=False)
     # Where a terminal is too narrow, names that nobody types are cut.
-    table.add_column("run", no_wrap=True, min_width=max(len(record.id) for record in shown))
-    for column in ("asset", "preset", "state", "stage", "progress"):
-        table.add_column(column, no_wrap=True)
+    for column in ("run", "asset", "preset", "state", "stage", "progress"):
+        is_cut = column in ("asset", "preset")
+        table.add_column(column, no_wrap=not is_cut, overflow="ellipsis")
     for column in ("age", "took"):
         table.add_column(column, justify="right", no_wrap=True)
     for record in shown:
@@ -93,7 +93,8 @@ def _tell(record: RunRecord, index: RunIndex, console: Console) -> None:
         "folder": record.folder,
         "state": state,
         "error": record.error,
-        "progress": f"{record.stage} {progress_of(record)}",
+        "stage": record.stage,
+        "progress": progress_of(record),
         "started": time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(record.started)),
         "took": in_short(record.duration_s),
         "process": f"{record.process.pid} on {record.process.host}",
@@ -117,11 +118,11 @@ def _tell(record: RunRecord, index: RunIndex, console: Console) -> None:
 
 
 def progress_of(record: RunRecord) -> str:
-    """Stages that are there of those that are wanted, and the steps of the one at work."""
+    """Stages that are there of those that are wanted, and how far the one at work is."""
     wanted = [stage for stage in record.stages.values() if stage.key]
     there = sum(stage.state in (CACHED, COMPUTED) for stage in wanted)
-    steps = f", {record.step}/{record.total}" if record.total else ""
-    return f"{there}/{len(wanted)}{steps}"
+    share = f" {record.step / record.total:.0%}" if record.total else ""
+    return f"{there}/{len(wanted)}{share}"
 
 
 def in_short(seconds: float) -> str:

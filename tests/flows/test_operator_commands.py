@@ -54,7 +54,7 @@ def test_status_tells_the_state_of_every_folders_newest_run(svim3d, index):
     assert rows[0].split()[:6] == [page(4).id, "cat4", "standard", "failed", "nerf", "0/1"]
     assert rows[1].split()[:4] == [page(2).id, "cat2", "standard", "died"]
     assert rows[1].split()[-4:] == ["17", "min", "60", "s"]
-    assert rows[2].split()[3:7] == ["running", "nerf", "1/1,", "30/200"]
+    assert rows[2].split()[3:7] == ["running", "nerf", "1/1", "15%"]
     assert summary == "3 runs: 1 failed, 1 died, 1 running"
 
 
