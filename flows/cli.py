@@ -5,6 +5,7 @@ store can answer never loads torch or Prefect.
 """
 
 import argparse
+import importlib
 import os
 import sys
 import traceback
@@ -13,11 +14,25 @@ from pathlib import Path
 
 from flows.data_options import data_options
 from flows.model_options import model_options
+from flows.operator_options import logs_options, resume_options, status_options, store_options
 from flows.options import edit_options, job_options, photo_settings, relight_options
 from flows.train_options import train_options
 
 DONE, FAILED, BAD_INPUT, CANCELLED = 0, 1, 2, 130
 DEFAULT_STORE = Path(".svim3d")
+
+# Commands whose options go to the function of the same name in a module of their own.
+DOERS = {
+    "relight": "flows.relight",
+    "edit": "flows.edit",
+    "train": "flows.train",
+    "data": "flows.data",
+    "model": "flows.model",
+    "status": "flows.runs",
+    "resume": "flows.runs",
+    "logs": "flows.runs",
+    "store": "flows.store",
+}
 
 # Thread pools that spin while they wait starve each other: two of them on two cores made the
 # slowest tenth of 23 ms steps six times as long. Must be set before torch is imported.
@@ -30,6 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ.setdefault(name, value)
     parser = _parser()
     options = parser.parse_args(arguments)
+    options.given = tuple(sys.argv[1:] if arguments is None else arguments)
     if options.command is None:
         parser.print_help()
         return BAD_INPUT
@@ -56,26 +72,8 @@ def _dispatch(options: argparse.Namespace) -> int:
         from flows.doctor import doctor
 
         return doctor(options.store)
-    if options.command == "relight":
-        from flows.relight import relight
-
-        return relight(options)
-    if options.command == "edit":
-        from flows.edit import edit
-
-        return edit(options)
-    if options.command == "train":
-        from flows.train import train
-
-        return train(options)
-    if options.command == "data":
-        from flows.data import data
-
-        return data(options)
-    if options.command == "model":
-        from flows.model import model
-
-        return model(options)
+    if options.command in DOERS:
+        return getattr(importlib.import_module(DOERS[options.command]), options.command)(options)
     from flows import commands
 
     if options.command == "presets":
@@ -121,6 +119,10 @@ def _parser() -> argparse.ArgumentParser:
         ("data", [data_options(), shared], "render training data for the generator"),
         ("model", [model_options(shared)], "convert a checkpoint, or tell what a model holds"),
         ("plan", [job, shared], "say which stages a run would compute, and why"),
+        ("status", [status_options(), shared], "tell how runs go and went"),
+        ("resume", [resume_options(), shared], "carry out again what did not come to its end"),
+        ("logs", [logs_options(), shared], "print what the stages of a run said"),
+        ("store", [store_options(shared)], "look at the artifacts, clean up, move them"),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
     ):

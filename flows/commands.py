@@ -55,6 +55,25 @@ class Request:
         name = self.source if self.source in SHIPPED else self.path.resolve().stem
         return self.out or OUTPUT_ROOT / name
 
+    @property
+    def command(self) -> tuple[str, ...]:
+        """Arguments of `svim3d` that ask for the same; relative paths in overrides stay so."""
+        source = self.source if self.source in SHIPPED else str(self.path.resolve())
+        lists = {
+            "--set": self.overrides,
+            "--skip": sorted(self.skip),
+            "--from": [self.start],
+            "--until": [self.until],
+            "--only": [self.only],
+            "--force": sorted(self.force),
+        }
+        return (
+            *("run", source, "-o", str(self.run_folder.resolve()), "--preset", self.preset),
+            *(f"{option}={value}" for option, values in lists.items() for value in values if value),
+            *("--seed", str(self.seed), "--device", self.device),
+            *("--store", str(self.store.resolve())),
+        )
+
     def plan(self, store: Store) -> Plan:
         """Resolve settings and look every stage up in the store."""
         config = load_config(PipelineConfig, self.preset, self.overrides, self.skip)
@@ -81,7 +100,7 @@ def show_plan(request: Request) -> int:
 
 def run(request: Request) -> int:
     """Make the asset, or find it made; ends with a table of all stages."""
-    job = Job(request.store, request.run_folder, request.device, Console())
+    job = Job(request.store, request.run_folder, request.device, Console(), request.command)
     return job.carry_out(
         request.plan(job.store), {"preset": request.preset}, compute=compute_under_engine
     )

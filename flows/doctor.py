@@ -68,8 +68,7 @@ def _installation() -> Iterator[tuple[str, str, bool]]:
 
 def _store(store: Store) -> Iterator[tuple[str, str, bool]]:
     """State of every artifact, by its content."""
-    folder = store.root / "obj"
-    keys = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
+    keys = store.keys()
     health = {key: store.check(key) for key in keys}
     size = sum(h.stored.manifest.size for h in health.values() if h.stored)
     yield "store", f"{store.root}: {len(keys)} artifacts, {size / 2**20:.0f} MiB", True

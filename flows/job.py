@@ -2,18 +2,22 @@
 
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from flows.console import RunDisplay, result_table, stage_warnings_on
 from flows.engine import Engine
 from flows.plan import Plan, Verdict
+from flows.recording import Audience, RunRecorder
 from flows.run_folder import require_ours, write_run_folder
 from stages.store import Store, Stored
+
+if TYPE_CHECKING:
+    from flows.steps import Observer
 
 DONE = 0
 
@@ -28,17 +32,35 @@ class Job:
         out: the run folder.
         device: "auto", "cpu" or "cuda".
         console: where progress and results are told.
+
+    Args:
+        command: arguments of `svim3d` that do the same again, for `svim3d resume`.
     """
 
-    def __init__(self, store: Path, out: Path, device: str, console: Console) -> None:
+    def __init__(
+        self,
+        store: Path,
+        out: Path,
+        device: str,
+        console: Console,
+        command: Sequence[str] = (),
+    ) -> None:
         self._start = time.monotonic()
+        self._command = command
+        self._recorder: RunRecorder | None = None
         self.out = out
         self.device = device
         self.console = console
-        self.store = Store(
-            store,
-            say=lambda text: console.print(text, style="yellow", highlight=False, markup=False),
-        )
+        self.store = Store(store, say=self._say)
+
+    def _say(self, text: str) -> None:
+        self.console.print(text, style="yellow", highlight=False, markup=False)
+        if self._recorder is not None:
+            self._recorder.say(text)
+
+    def watched_by(self, display: "Observer") -> "Observer":
+        """Who is told of the stages: a display, and the run's record."""
+        return Audience(display, self._recorder) if self._recorder else display
 
     def carry_out(self, plan: Plan, about: Mapping[str, Any], *, compute: Compute) -> int:
         """Compute what is missing, write the run folder, print the table of all stages.
@@ -50,6 +72,17 @@ class Job:
         """
         require_ours(self.out, plan.pipeline)
         interrupt_on_stop()
+        self._recorder = RunRecorder(
+            self.store,
+            plan,
+            self.out,
+            preset=str(about.get("preset", "")),
+            command=self._command,
+        )
+        with self._recorder:
+            return self._carry_out(plan, about, compute)
+
+    def _carry_out(self, plan: Plan, about: Mapping[str, Any], compute: Compute) -> int:
         if plan.to_compute:
             artifacts, told = compute(plan, self)
         else:
@@ -95,7 +128,7 @@ def compute_under_engine(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[
             step.node.load()
         engine.wait()
         with stage_warnings_on(job.console), RunDisplay(job.console) as display:
-            artifacts = run_plan(Bench(plan, job.store, device, display))
+            artifacts = run_plan(Bench(plan, job.store, device, job.watched_by(display)))
         return artifacts, {"engine_startup_s": round(engine.waited_s, 2)}
 
 
@@ -106,7 +139,7 @@ def compute_here(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[str, Any
 
     artifacts: dict[str, Stored] = {}
     with stage_warnings_on(job.console), RunDisplay(job.console) as display:
-        bench = Bench(plan, job.store, choose_device(job.device), display)
+        bench = Bench(plan, job.store, choose_device(job.device), job.watched_by(display))
         for step in plan.steps:
             if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):
                 artifacts[step.node.name] = obtain_step(step, artifacts, bench)

@@ -51,7 +51,7 @@ def relight(options: argparse.Namespace) -> int:
     given = {name: value for name, value in settings.items() if value is not None}
     _require_files(options.env, options.mask)
     config = validated(RelightRunConfig, {"relight": given})
-    job = Job(options.store, _run_folder(options), options.device, Console())
+    job = Job(options.store, _run_folder(options), options.device, Console(), options.given)
     plan = make_plan(
         RELIGHT,
         config,

@@ -4,8 +4,9 @@
     work/<key>/   what an unfinished computation keeps: checkpoints, scalars, the new artifact
     lock/<key>    held while one process computes the key
     bad/          artifacts that were found damaged, kept for inspection
+    trash/        what `stages.store_cleaning` has taken out and not deleted yet
 
-All four lie on one file system, so that publishing is one rename. A lock is the kernel's: it goes
+All five lie on one file system, so that publishing is one rename. A lock is the kernel's: it goes
 with its process, however that ends. It binds the processes of one machine; on a shared drive two
 machines may compute the same key, and the second to publish finds the first's artifact in place.
 """
@@ -117,6 +118,11 @@ class Store:
         self._verified.add(key)
         return Health("ok", stored=Stored(folder / FILES_FOLDER, manifest, is_cached=True))
 
+    def keys(self) -> list[str]:
+        """Names of all that is published, sound or not."""
+        folder = self.root / "obj"
+        return sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
+
     def recent(self, limit: int) -> Iterator[Manifest]:
         """Readable manifests of the latest published artifacts, newest first."""
         folders = self.root / "obj"
@@ -151,6 +157,34 @@ class Store:
                 shutil.rmtree(self.work(key), ignore_errors=True)
                 return found
             return self._compute(recipe, compute)
+
+    def adopt(self, key: str, artifact: Path) -> bool:
+        """Publish an artifact made elsewhere; False if there is a sound one, which then stays.
+
+        Args:
+            key: its content address.
+            artifact: its folder, on the store's file system and known to be sound; it is moved.
+
+        Raises:
+            TransientError: the disk is full, or another process holds the key for too long.
+            InputError: the store cannot be written.
+        """
+        with self._explained(), self._locked(key):
+            if self.check(key).stored:
+                return False
+            self._quarantine_if_damaged(key)
+            self._publish(key, artifact)
+            return True
+
+    def quarantine(self, key: str) -> None:
+        """Set a damaged artifact aside, so that the next run that wants it computes it anew.
+
+        Raises:
+            TransientError: another process holds the key for too long.
+            InputError: the store cannot be written.
+        """
+        with self._explained(), self._locked(key):
+            self._quarantine_if_damaged(key)
 
     def _compute(self, recipe: Recipe, compute: Compute) -> Stored:
         key, work = recipe.key, self.work(recipe.key)
@@ -190,7 +224,8 @@ class Store:
             bad.parent.mkdir(exist_ok=True)
             self.artifact(key).rename(bad)
             self._say(
-                f"artifact {key[:8]} is damaged ({health.damage}): moved to {bad}, recomputing"
+                f"artifact {key[:8]} is damaged ({health.damage}): moved to {bad}, "
+                "to be computed anew"
             )
 
     def _require_space(self) -> None:

@@ -14,6 +14,7 @@ import torch
 from tiny_runs import plan_tiny
 
 from flows import cli
+from flows.run_records import CANCELLED, COMPUTING, DIED, RunIndex, StageRecord
 from stages.errors import InputError
 from stages.store import Store, Stored
 
@@ -161,6 +162,11 @@ def test_stopped_run_goes_on_and_ends_with_equal_bytes(engine, tmp_path, source,
     assert process.returncode == code, errors
     assert ("goes on where this one stopped" in errors) == (code == 130)
     assert (store.work(walk) / "checkpoint.safetensors").exists()
+    record = RunIndex(store.root).find(str(tmp_path / "out"))
+    assert record.now == (CANCELLED if code == 130 else DIED)
+    assert record.stages["walk"] == StageRecord(walk, COMPUTING)
+    log = RunIndex(store.root).log(record.id).read_text()
+    assert f"computing {walk[:8]}" in log and ("cancelled after" in log) == (code == 130)
 
     assert tiny_command.main([str(a) for a in command]) == cli.DONE
     page = json.loads((tmp_path / "out" / "run.json").read_text())
