@@ -93,6 +93,7 @@ def _dispatch(options: argparse.Namespace) -> int:
         seed=options.seed,
         device=options.device,
         store=options.store,
+        timeouts=tuple(options.timeout),
     )
     return commands.show_plan(request) if options.command == "plan" else commands.run(request)
 

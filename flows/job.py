@@ -28,6 +28,7 @@ class Job:
         out: the run folder.
         device: "auto", "cpu" or "cuda".
         console: where progress and results are told.
+        limits_s: seconds after which a stage is stopped, by its name.
     """
 
     def __init__(self, store: Path, out: Path, device: str, console: Console) -> None:
@@ -35,6 +36,7 @@ class Job:
         self.out = out
         self.device = device
         self.console = console
+        self.limits_s: Mapping[str, float] = {}
         self.store = Store(
             store,
             say=lambda text: console.print(text, style="yellow", highlight=False, markup=False),
@@ -95,7 +97,7 @@ def compute_under_engine(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[
             step.node.load()
         engine.wait()
         with stage_warnings_on(job.console), RunDisplay(job.console) as display:
-            artifacts = run_plan(Bench(plan, job.store, device, display))
+            artifacts = run_plan(Bench(plan, job.store, device, display, job.limits_s))
         return artifacts, {"engine_startup_s": round(engine.waited_s, 2)}
 
 
@@ -106,7 +108,7 @@ def compute_here(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[str, Any
 
     artifacts: dict[str, Stored] = {}
     with stage_warnings_on(job.console), RunDisplay(job.console) as display:
-        bench = Bench(plan, job.store, choose_device(job.device), display)
+        bench = Bench(plan, job.store, choose_device(job.device), display, job.limits_s)
         for step in plan.steps:
             if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):
                 artifacts[step.node.name] = obtain_step(step, artifacts, bench)

@@ -33,7 +33,7 @@ def job_options() -> argparse.ArgumentParser:
         metavar="STAGE.NAME=VALUE",
         help="change one setting; may be repeated",
     )
-    _add_photo(job)
+    add_photo(job)
     for option, target, purpose in (
         ("--from", "start", "recompute this stage and all after it"),
         ("--until", "until", "stop after this stage"),
@@ -54,11 +54,24 @@ def job_options() -> argparse.ArgumentParser:
         metavar="STAGE",
         help="recompute a stage though nothing changed; may be repeated",
     )
-    _add_machine(job)
+    add_timeout(job)
+    add_machine(job)
     return job
 
 
-def _add_photo(job: argparse.ArgumentParser) -> None:
+def add_timeout(parser: argparse.ArgumentParser) -> None:
+    """The option for time limits; `flows.limits` reads it."""
+    parser.add_argument(
+        "--timeout",
+        action="append",
+        default=[],
+        metavar="[STAGE=]SECONDS",
+        help="stop a stage (without a name: any) that runs longer; what it has done so far is "
+        "kept; may be repeated",
+    )
+
+
+def add_photo(job: argparse.ArgumentParser) -> None:
     """Short forms of settings that most photos are run with."""
     photo = job.add_argument_group("photos")
     photo.add_argument(
@@ -106,7 +119,7 @@ def relight_options() -> argparse.ArgumentParser:
     )
     _add_light_and_paint(options)
     _add_rendering(options)
-    _add_machine(options)
+    add_machine(options)
     options.add_argument("--force", action="store_true", help="compute again though it is there")
     return options
 
@@ -200,7 +213,7 @@ def _add_rendering(options: argparse.ArgumentParser) -> None:
     views.add_argument("--fov", type=float, metavar="DEG", help="vertical, of those cameras (33.8)")
 
 
-def _add_machine(parser: argparse.ArgumentParser) -> None:
+def add_machine(parser: argparse.ArgumentParser) -> None:
     """What decides how numbers come about, shared by all commands that compute."""
     parser.add_argument("--seed", type=int, default=0, help="of all random numbers (%(default)s)")
     parser.add_argument(

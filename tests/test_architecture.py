@@ -56,7 +56,17 @@ MAY_IMPORT = {
     "stages.prefilter_cache": ("svim3d", "stages.keys"),
     "stages.manifest": ("stages.keys",),
     "stages.store": ("stages.keys", "stages.manifest", "stages.errors"),
-    "stages.execution": (*CONTRACT, "stages.keys", "stages.store"),
+    "stages.faults": ("stages.errors", "stages.store"),
+    "stages.time_limit": ("stages.errors",),
+    "stages.device_slot": (),
+    "stages.execution": (
+        *CONTRACT,
+        "stages.keys",
+        "stages.store",
+        "stages.faults",
+        "stages.time_limit",
+        "stages.device_slot",
+    ),
     "flows": ("flows", "stages"),
 }
 # Inside svim3d a unit of the middle tier sees itself and the basics.
@@ -102,6 +112,7 @@ LIGHT = (
     "flows.edit",
     "flows.engine",
     "flows.job",
+    "flows.limits",
     "flows.model",
     "flows.model_options",
     "flows.options",
