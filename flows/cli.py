@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
+from flows.batch_options import batch_options
 from flows.data_options import data_options
 from flows.model_options import model_options
 from flows.options import edit_options, job_options, photo_settings, relight_options
@@ -56,6 +57,10 @@ def _dispatch(options: argparse.Namespace) -> int:
         from flows.doctor import doctor
 
         return doctor(options.store)
+    if options.command == "batch":
+        from flows.batch import batch
+
+        return batch(options)
     if options.command == "relight":
         from flows.relight import relight
 
@@ -116,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     for name, parents, purpose in (
         ("run", [job, shared], "make the asset; finished stages are taken from the store"),
+        ("batch", [batch_options(), shared], "make the assets of many inputs"),
         ("relight", [relight_options(), shared], "show views or an asset under another light"),
         ("edit", [edit_options(), shared], "write an asset with other materials"),
         ("train", [train_options(), shared], "train a generator on rendered examples"),

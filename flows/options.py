@@ -23,16 +23,7 @@ def job_options() -> argparse.ArgumentParser:
     job.add_argument(
         "-o", "--output", type=Path, metavar="OUT", help="run folder (out/<name of the input>)"
     )
-    job.add_argument(
-        "--preset", default="standard", help="preview, standard or paper (%(default)s)"
-    )
-    job.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="STAGE.NAME=VALUE",
-        help="change one setting; may be repeated",
-    )
+    add_settings(job)
     add_photo(job)
     for option, target, purpose in (
         ("--from", "start", "recompute this stage and all after it"),
@@ -40,13 +31,6 @@ def job_options() -> argparse.ArgumentParser:
         ("--only", "only", "this stage alone; what it needs must be in the store"),
     ):
         job.add_argument(option, dest=target, metavar="STAGE", help=purpose)
-    job.add_argument(
-        "--skip",
-        action="append",
-        default=[],
-        metavar="STAGE",
-        help=f"leave a stage out ({', '.join(IMAGE_TO_ASSET.skippable)}); may be repeated",
-    )
     job.add_argument(
         "--force",
         action="append",
@@ -57,6 +41,27 @@ def job_options() -> argparse.ArgumentParser:
     add_timeout(job)
     add_machine(job)
     return job
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Preset, single settings, and what is left out."""
+    parser.add_argument(
+        "--preset", default="standard", help="preview, standard or paper (%(default)s)"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="STAGE.NAME=VALUE",
+        help="change one setting; may be repeated",
+    )
+    parser.add_argument(
+        "--skip",
+        action="append",
+        default=[],
+        metavar="STAGE",
+        help=f"leave a stage out ({', '.join(IMAGE_TO_ASSET.skippable)}); may be repeated",
+    )
 
 
 def add_timeout(parser: argparse.ArgumentParser) -> None:

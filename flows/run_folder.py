@@ -43,14 +43,14 @@ def write_run_folder(
         out.mkdir(parents=True, exist_ok=True)
         # First of all the mark of a run folder, in case this is killed half-way.
         if not (out / RUN_PAGE).exists():
-            _replace(out / RUN_PAGE, b"{}")
+            replace_file(out / RUN_PAGE, b"{}")
         for node in plan.pipeline.nodes:
             stored = artifacts.get(node.name)
             _link(out / node.name, store.artifact(stored.key) if stored else None)
         for product in plan.pipeline.products:
             _copy_product(out, product, artifacts)
         page = json.dumps(_page(plan, artifacts, about), indent=1)
-        _replace(out / RUN_PAGE, page.encode())
+        replace_file(out / RUN_PAGE, page.encode())
     except OSError as error:
         raise InputError(f"the run folder {out} cannot be written: {error}") from error
 
@@ -90,7 +90,7 @@ def _copy_product(out: Path, product: Product, artifacts: Mapping[str, Stored]) 
     for stage, name in product.origins:
         source = artifacts[stage].folder / name if stage in artifacts else None
         if source is not None and source.is_file():
-            return _replace(target, source.read_bytes())
+            return replace_file(target, source.read_bytes())
         if source is not None and source.is_dir():
             shutil.rmtree(target, ignore_errors=True)
             shutil.copytree(source, target)
@@ -101,7 +101,7 @@ def _copy_product(out: Path, product: Product, artifacts: Mapping[str, Stored]) 
     return None
 
 
-def _replace(file: Path, content: bytes) -> None:
+def replace_file(file: Path, content: bytes) -> None:
     """Write a file so that a reader sees the old or the new one."""
     partial = file.with_name(f".{file.name}.{os.getpid()}")
     partial.write_bytes(content)

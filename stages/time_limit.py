@@ -59,17 +59,15 @@ def _alarm(limit_s: float, message: str, grace_s: float) -> Iterator[None]:
         raise StageTimeoutError(message)
 
     earlier = signal.signal(signal.SIGALRM, stop)
-    has_errors = sys.__stderr__ is not None
-    if has_errors:
-        faulthandler.dump_traceback_later(limit_s + grace_s, exit=True, file=sys.__stderr__)
+    if (errors := sys.__stderr__) is not None:
+        faulthandler.dump_traceback_later(limit_s + grace_s, exit=True, file=errors)
     signal.setitimer(signal.ITIMER_REAL, limit_s, AGAIN_S)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, earlier)
-        if has_errors:
-            faulthandler.cancel_dump_traceback_later()
+        faulthandler.cancel_dump_traceback_later()
 
 
 @contextlib.contextmanager

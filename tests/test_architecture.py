@@ -75,6 +75,9 @@ UNITS = {name: f"svim3d.{name}" for name in (*MIDDLE, "render", "synthesis", "io
 # One library, one door.
 DOORS = {
     "prefect": ("flows",),
+    "prefect_dask": ("flows.batch_flow",),
+    "prefect_ray": ("flows.batch_flow",),
+    "cloudpickle": ("flows.workers",),
     "uvicorn": ("flows.engine_server",),
     "rich": ("flows",),
     "pydantic": ("flows", "stages.settings"),
@@ -103,6 +106,12 @@ DOORS = {
 }
 # What a plan and `--help` load: no torch, no Prefect at the top of these modules.
 LIGHT = (
+    "flows.batch",
+    "flows.batch_inputs",
+    "flows.batch_job",
+    "flows.batch_options",
+    "flows.batch_results",
+    "flows.workers",
     "flows.cli",
     "flows.commands",
     "flows.config",
