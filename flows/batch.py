@@ -1,6 +1,7 @@
 """`svim3d batch`: many inputs, each a run of its own; what is there already is not done again."""
 
 import argparse
+import importlib.util
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -22,16 +23,17 @@ from flows.run_folder import require_ours
 from stages.errors import InputError
 from stages.store import Store
 
+LOCAL = "local"  # the runner that needs no package
 ALL_DONE, SOME_FAILED = 0, 1
-SHOWN_FAILURES = 10
 
 
 def batch(options: argparse.Namespace) -> int:
     """Carry out what the command line names; see `svim3d batch --help`."""
     if options.jobs < 1:
         raise InputError(f"--jobs {options.jobs}: wanted at least one")
-    if options.address and options.runner == "local":
+    if options.address and options.runner == LOCAL:
         raise InputError("--address names a cluster; say --runner dask or ray with it")
+    _require_runner(options.runner)
     entries = read_entries(options.input, IMAGE_TO_ASSET.takes)
     # What is wrong for all is refused before any.
     overrides = (*photo_settings(options), *options.set)
@@ -54,6 +56,11 @@ def batch(options: argparse.Namespace) -> int:
     return SOME_FAILED if run.results.count(State.FAILED) else ALL_DONE
 
 
+def _require_runner(name: str) -> None:
+    if name != LOCAL and importlib.util.find_spec(f"prefect_{name}") is None:
+        raise InputError(f"--runner {name} needs a package more: pip install 'svim3d[{name}]'")
+
+
 def _job(
     entry: Entry,
     options: argparse.Namespace,
@@ -74,6 +81,7 @@ def _job(
         device=options.device,
         store=options.store,
         limits_s=limits_s,
+        share=options.share,
     )
 
 
@@ -172,7 +180,7 @@ def _compute(groups: list[list[BatchJob]], run: _Run, options: argparse.Namespac
                 Batch(
                     [group[0] for group in groups],
                     lambda job, outcome: run.settle(group_of[job.name], outcome),
-                    workers if options.runner == "local" else None,
+                    workers if options.runner == LOCAL else None,
                 ),
                 runner,
                 name=options.output.name or "batch",

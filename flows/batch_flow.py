@@ -17,7 +17,6 @@ from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
 from flows.batch_job import BatchJob, do_job
 from flows.workers import Workers
-from stages.errors import InputError
 
 Told = Callable[[BatchJob, float | BaseException], None]
 
@@ -53,27 +52,19 @@ def make_runner(name: str, jobs: int, address: str | None) -> TaskRunner[Any]:
         name: of the runner.
         jobs: inputs at a time, where the runner starts its own processes.
         address: of a cluster that runs already.
-
-    Raises:
-        InputError: its package is missing.
     """
-    if name == "local":
-        return ThreadPoolTaskRunner(max_workers=jobs)
-    try:
-        if name == "dask":
-            from prefect_dask import DaskTaskRunner
+    if name == "dask":
+        from prefect_dask import DaskTaskRunner
 
-            own = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None}
-            given = {"address": address} if address else {"cluster_kwargs": own}
-            return DaskTaskRunner(**given)
+        own = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None}
+        given = {"address": address} if address else {"cluster_kwargs": own}
+        return DaskTaskRunner(**given)
+    if name == "ray":
         from prefect_ray import RayTaskRunner
 
         settings = {} if address else {"num_cpus": jobs, "include_dashboard": False}
         return RayTaskRunner(address=address, init_kwargs=settings)
-    except ImportError as error:
-        raise InputError(
-            f"--runner {name} needs a package more ({error}): pip install 'svim3d[{name}]'"
-        ) from error
+    return ThreadPoolTaskRunner(max_workers=jobs)
 
 
 def run_batch(batch: Batch, runner: TaskRunner[Any], name: str) -> None:
@@ -121,6 +112,7 @@ def _run_inputs(inputs: int) -> State[None]:
             named = work.with_options(name=job.name, task_run_name=job.name)
             futures[named.submit(job)] = job
         for future in as_completed(list(futures)):
+            outcome: float | Exception
             try:
                 outcome = future.result()
             except Exception as error:

@@ -18,6 +18,8 @@ from stages.store import Store, Stored
 if TYPE_CHECKING:
     from stages.base import Progress
 
+log = logging.getLogger("stages")  # where stages and store warn
+
 LOG = "log.txt"  # in a run folder: what stages and store warned of
 
 
@@ -38,6 +40,7 @@ class BatchJob:
         device: "auto", "cpu" or "cuda".
         store: folder of the artifacts.
         limits_s: seconds that stages may take, by name.
+        share: URL of a store that machines share.
         lost_workers: processes that died over this input before.
     """
 
@@ -53,6 +56,7 @@ class BatchJob:
     device: str
     store: Path
     limits_s: Mapping[str, float] = field(default_factory=dict)
+    share: str | None = None
     lost_workers: int = 0
 
     def plan(self, store: Store) -> Plan:
@@ -125,8 +129,9 @@ def do_job(job: BatchJob) -> float:
             from flows.image_to_asset import run_plan
             from flows.steps import Bench
             from stages.execution import choose_device
+            from stages.shared_store import open_store
 
-            store = Store(job.store)
+            store = open_store(job.store, job.share, say=log.warning)
             plan = job.plan(store)
             require_ours(job.out, plan.pipeline)
             bench = Bench(plan, store, choose_device(job.device), watch, job.limits_s)
@@ -144,14 +149,13 @@ def _log_in(folder: Path) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     handler = logging.FileHandler(folder / LOG)
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
-    logger = logging.getLogger("stages")
-    logger.addHandler(handler)
-    logger.propagate = False
+    log.addHandler(handler)
+    log.propagate = False
     try:
         yield
     finally:
-        logger.propagate = True
-        logger.removeHandler(handler)
+        log.propagate = True
+        log.removeHandler(handler)
         handler.close()
 
 
@@ -168,9 +172,7 @@ class _Watch:
         pass
 
     def failed(self, step: Step, error: BaseException) -> None:
-        logging.getLogger("stages").warning(
-            "%s: %s: %s", step.node.name, type(error).__name__, error
-        )
+        log.warning("%s: %s: %s", step.node.name, type(error).__name__, error)
 
     def finished(self, step: Step, stored: Stored) -> None:
         self.stage = ""

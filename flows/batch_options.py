@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from flows.options import add_machine, add_photo, add_settings, add_timeout
+from flows.options import add_machine, add_photo, add_settings, add_share, add_timeout
 
 
 def batch_options() -> argparse.ArgumentParser:
@@ -27,6 +27,7 @@ def batch_options() -> argparse.ArgumentParser:
     add_settings(options)
     add_photo(options)
     add_timeout(options)
+    add_share(options)
     add_machine(options)
     how = options.add_argument_group("many at a time")
     how.add_argument(

@@ -99,6 +99,7 @@ def _dispatch(options: argparse.Namespace) -> int:
         device=options.device,
         store=options.store,
         timeouts=tuple(options.timeout),
+        share=options.share,
     )
     return commands.show_plan(request) if options.command == "plan" else commands.run(request)
 

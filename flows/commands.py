@@ -45,6 +45,7 @@ class Request:
     device: str
     store: Path
     timeouts: tuple[str, ...] = ()
+    share: str | None = None
 
     @property
     def path(self) -> Path:
@@ -83,7 +84,7 @@ def show_plan(request: Request) -> int:
 
 def run(request: Request) -> int:
     """Make the asset, or find it made; ends with a table of all stages."""
-    job = Job(request.store, request.run_folder, request.device, Console())
+    job = Job(request.store, request.run_folder, request.device, Console(), share=request.share)
     job.limits_s = parse_limits(request.timeouts, IMAGE_TO_ASSET.names)
     return job.carry_out(
         request.plan(job.store), {"preset": request.preset}, compute=compute_under_engine

@@ -13,7 +13,8 @@ from flows.console import RunDisplay, result_table, stage_warnings_on
 from flows.engine import Engine
 from flows.plan import Plan, Verdict
 from flows.run_folder import require_ours, write_run_folder
-from stages.store import Store, Stored
+from stages.shared_store import open_store
+from stages.store import Stored
 
 DONE = 0
 
@@ -29,16 +30,27 @@ class Job:
         device: "auto", "cpu" or "cuda".
         console: where progress and results are told.
         limits_s: seconds after which a stage is stopped, by its name.
+
+    Args:
+        share: URL of a store that other machines use too.
     """
 
-    def __init__(self, store: Path, out: Path, device: str, console: Console) -> None:
+    def __init__(
+        self,
+        store: Path,
+        out: Path,
+        device: str,
+        console: Console,
+        share: str | None = None,
+    ) -> None:
         self._start = time.monotonic()
         self.out = out
         self.device = device
         self.console = console
         self.limits_s: Mapping[str, float] = {}
-        self.store = Store(
+        self.store = open_store(
             store,
+            share,
             say=lambda text: console.print(text, style="yellow", highlight=False, markup=False),
         )
 

@@ -39,8 +39,19 @@ def job_options() -> argparse.ArgumentParser:
         help="recompute a stage though nothing changed; may be repeated",
     )
     add_timeout(job)
+    add_share(job)
     add_machine(job)
     return job
+
+
+def add_share(parser: argparse.ArgumentParser) -> None:
+    """The option for a store that machines share."""
+    parser.add_argument(
+        "--share",
+        metavar="URL",
+        help="also fetch artifacts from, and publish them to, a store that other machines use: "
+        "file:///mnt/..., s3://bucket/... (pip install 'svim3d[s3]'), or what else fsspec knows",
+    )
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:

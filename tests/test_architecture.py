@@ -56,6 +56,7 @@ MAY_IMPORT = {
     "stages.prefilter_cache": ("svim3d", "stages.keys"),
     "stages.manifest": ("stages.keys",),
     "stages.store": ("stages.keys", "stages.manifest", "stages.errors"),
+    "stages.shared_store": ("stages.store", "stages.keys", "stages.manifest", "stages.errors"),
     "stages.faults": ("stages.errors", "stages.store"),
     "stages.time_limit": ("stages.errors",),
     "stages.device_slot": (),
@@ -77,6 +78,7 @@ DOORS = {
     "prefect": ("flows",),
     "prefect_dask": ("flows.batch_flow",),
     "prefect_ray": ("flows.batch_flow",),
+    "fsspec": ("stages.shared_store",),
     "cloudpickle": ("flows.workers",),
     "uvicorn": ("flows.engine_server",),
     "rich": ("flows",),
@@ -132,6 +134,7 @@ LIGHT = (
     "stages.errors",
     "stages.keys",
     "stages.manifest",
+    "stages.shared_store",
     "stages.store",
     "stages.settings",
 )

@@ -51,8 +51,8 @@ def test_batch_isolates_failures_replaces_workers_and_goes_on(engine, tmp_path, 
         assert table[name]["asset"] == str(out / name / "total.safetensors")
     same = [(out / name / "total.safetensors").read_bytes() for name in ("a", "twin", "other")]
     assert same[0] == same[1] != same[2]
-    # a and twin are one recipe; lost has its own, the same stages of broken and doomed none.
-    assert sum(1 for _ in Store(store).recent(99)) == 3 + 2 + 3 + 1
+    # a and twin are one recipe of three stages, other and lost have theirs, doomed got to one.
+    assert sum(1 for _ in Store(store).recent(99)) == 3 + 3 + 3 + 1
     assert "4 failed" in capsys.readouterr().out.split("results.csv: ")[1]
 
     # What is left is what failed; mended inputs are computed, and others not touched.
