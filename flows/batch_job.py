@@ -1,5 +1,6 @@
 """One input of a batch, carried out by whoever is given it: this process, a worker, a cluster."""
 
+import functools
 import json
 import logging
 import time
@@ -13,12 +14,18 @@ from flows.config import RunConfig, load_config
 from flows.pipeline import Pipeline
 from flows.plan import Plan, Selection, Step, make_plan
 from flows.run_folder import RUN_PAGE, require_ours, write_run_folder
+from stages.keys import code_digests
 from stages.store import Store, Stored
 
 if TYPE_CHECKING:
     from stages.base import Progress
 
 log = logging.getLogger("stages")  # where stages and store warn
+
+# Both read files that do not change while a batch runs, the same ones for all inputs: a plan takes
+# 9 ms of CPU instead of 260.
+_code = functools.cache(code_digests)
+_config = functools.cache(load_config)
 
 LOG = "log.txt"  # in a run folder: what stages and store warned of
 
@@ -63,11 +70,12 @@ class BatchJob:
         """Resolve settings and look every stage up in the store."""
         return make_plan(
             self.pipeline,
-            load_config(self.schema, self.preset, self.overrides, self.skip),
+            _config(self.schema, self.preset, self.overrides, self.skip),
             source=self.source,
             seed=self.seed,
             store=store,
             selection=Selection(skip=self.skip),
+            code=_code,
             explained=False,
         )
 

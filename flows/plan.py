@@ -168,6 +168,7 @@ def make_plan(
     seed: int,
     store: Store,
     selection: Selection,
+    code: Callable[[str], dict[str, str]] = code_digests,
     explained: bool = True,
 ) -> Plan:
     """Look up every stage in the store and say why those that are missing are.
@@ -179,6 +180,7 @@ def make_plan(
         seed: of the run.
         store: where artifacts are.
         selection: which part is asked for.
+        code: the digests of a module and of what it imports.
         explained: whether to look for the nearest artifact of each that is missing, which reads
             hundreds of manifests.
 
@@ -191,7 +193,7 @@ def make_plan(
     selection.check(pipeline)
     idle = {node.name for node in pipeline.nodes if not node.has_work_for(source)}
     selection.check_idle(idle, source)
-    recipes = _recipes(pipeline, config, source, seed, selection.skip | idle)
+    recipes = _recipes(pipeline, config, source, seed, selection.skip | idle, code)
     explain = _Explainer(store) if explained else _call_missing
     steps = []
     for node in pipeline.nodes:
@@ -205,7 +207,12 @@ def make_plan(
 
 
 def _recipes(
-    pipeline: Pipeline, config: RunConfig, source: Path, seed: int, skip: Iterable[str]
+    pipeline: Pipeline,
+    config: RunConfig,
+    source: Path,
+    seed: int,
+    skip: Iterable[str],
+    code: Callable[[str], dict[str, str]],
 ) -> dict[str, Recipe]:
     """Recipes of all stages that are not skipped: each names its inputs by their keys."""
     keys: dict[str, str] = {SOURCE: digest_input(source)}
@@ -220,7 +227,7 @@ def _recipes(
             config=getattr(config, node.name).model_dump(mode="json"),
             seed=seed,
             inputs={name: keys[name] for name in node.inputs},
-            code=code_digests(node.module),
+            code=code(node.module),
             versions=versions,
         )
         keys[node.name] = recipes[node.name].key
