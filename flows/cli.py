@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
+from flows.batch_options import batch_options
 from flows.data_options import data_options
 from flows.model_options import model_options
 from flows.operator_options import logs_options, resume_options, status_options, store_options
@@ -23,6 +24,7 @@ DEFAULT_STORE = Path(".svim3d")
 
 # Commands whose options go to the function of the same name in a module of their own.
 DOERS = {
+    "batch": "flows.batch",
     "relight": "flows.relight",
     "edit": "flows.edit",
     "train": "flows.train",
@@ -91,6 +93,8 @@ def _dispatch(options: argparse.Namespace) -> int:
         seed=options.seed,
         device=options.device,
         store=options.store,
+        timeouts=tuple(options.timeout),
+        share=options.share,
     )
     return commands.show_plan(request) if options.command == "plan" else commands.run(request)
 
@@ -113,6 +117,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     for name, parents, purpose in (
         ("run", [job, shared], "make the asset; finished stages are taken from the store"),
+        ("batch", [batch_options(), shared], "make the assets of many inputs"),
         ("relight", [relight_options(), shared], "show views or an asset under another light"),
         ("edit", [edit_options(), shared], "write an asset with other materials"),
         ("train", [train_options(), shared], "train a generator on rendered examples"),

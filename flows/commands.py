@@ -10,6 +10,7 @@ from rich.table import Table
 from flows.config import PRESETS, PipelineConfig, load_config, preset_about
 from flows.console import plan_table
 from flows.job import DONE, Job, compute_under_engine
+from flows.limits import parse_limits
 from flows.pipeline import IMAGE_TO_ASSET
 from flows.plan import Plan, Selection, make_plan
 from stages.store import Store
@@ -43,6 +44,8 @@ class Request:
     seed: int
     device: str
     store: Path
+    timeouts: tuple[str, ...] = ()
+    share: str | None = None
 
     @property
     def path(self) -> Path:
@@ -66,6 +69,8 @@ class Request:
             "--until": [self.until],
             "--only": [self.only],
             "--force": sorted(self.force),
+            "--timeout": self.timeouts,
+            "--share": [self.share],
         }
         return (
             *("run", source, "-o", str(self.run_folder.resolve()), "--preset", self.preset),
@@ -100,7 +105,15 @@ def show_plan(request: Request) -> int:
 
 def run(request: Request) -> int:
     """Make the asset, or find it made; ends with a table of all stages."""
-    job = Job(request.store, request.run_folder, request.device, Console(), request.command)
+    job = Job(
+        request.store,
+        request.run_folder,
+        request.device,
+        Console(),
+        command=request.command,
+        share=request.share,
+    )
+    job.limits_s = parse_limits(request.timeouts, IMAGE_TO_ASSET.names)
     return job.carry_out(
         request.plan(job.store), {"preset": request.preset}, compute=compute_under_engine
     )

@@ -14,7 +14,8 @@ from flows.engine import Engine
 from flows.plan import Plan, Verdict
 from flows.recording import Audience, RunRecorder
 from flows.run_folder import require_ours, write_run_folder
-from stages.store import Store, Stored
+from stages.shared_store import open_store
+from stages.store import Stored
 
 if TYPE_CHECKING:
     from flows.steps import Observer
@@ -32,9 +33,11 @@ class Job:
         out: the run folder.
         device: "auto", "cpu" or "cuda".
         console: where progress and results are told.
+        limits_s: seconds after which a stage is stopped, by its name.
 
     Args:
         command: arguments of `svim3d` that do the same again, for `svim3d resume`.
+        share: URL of a store that other machines use too.
     """
 
     def __init__(
@@ -44,6 +47,7 @@ class Job:
         device: str,
         console: Console,
         command: Sequence[str] = (),
+        share: str | None = None,
     ) -> None:
         self._start = time.monotonic()
         self._command = command
@@ -51,7 +55,8 @@ class Job:
         self.out = out
         self.device = device
         self.console = console
-        self.store = Store(store, say=self._say)
+        self.limits_s: Mapping[str, float] = {}
+        self.store = open_store(store, share, say=self._say)
 
     def _say(self, text: str) -> None:
         self.console.print(text, style="yellow", highlight=False, markup=False)
@@ -128,7 +133,8 @@ def compute_under_engine(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[
             step.node.load()
         engine.wait()
         with stage_warnings_on(job.console), RunDisplay(job.console) as display:
-            artifacts = run_plan(Bench(plan, job.store, device, job.watched_by(display)))
+            bench = Bench(plan, job.store, device, job.watched_by(display), job.limits_s)
+            artifacts = run_plan(bench)
         return artifacts, {"engine_startup_s": round(engine.waited_s, 2)}
 
 
@@ -139,7 +145,8 @@ def compute_here(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[str, Any
 
     artifacts: dict[str, Stored] = {}
     with stage_warnings_on(job.console), RunDisplay(job.console) as display:
-        bench = Bench(plan, job.store, choose_device(job.device), job.watched_by(display))
+        device, observer = choose_device(job.device), job.watched_by(display)
+        bench = Bench(plan, job.store, device, observer, job.limits_s)
         for step in plan.steps:
             if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):
                 artifacts[step.node.name] = obtain_step(step, artifacts, bench)

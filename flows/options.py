@@ -23,17 +23,8 @@ def job_options() -> argparse.ArgumentParser:
     job.add_argument(
         "-o", "--output", type=Path, metavar="OUT", help="run folder (out/<name of the input>)"
     )
-    job.add_argument(
-        "--preset", default="standard", help="preview, standard or paper (%(default)s)"
-    )
-    job.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="STAGE.NAME=VALUE",
-        help="change one setting; may be repeated",
-    )
-    _add_photo(job)
+    add_settings(job)
+    add_photo(job)
     for option, target, purpose in (
         ("--from", "start", "recompute this stage and all after it"),
         ("--until", "until", "stop after this stage"),
@@ -41,24 +32,62 @@ def job_options() -> argparse.ArgumentParser:
     ):
         job.add_argument(option, dest=target, metavar="STAGE", help=purpose)
     job.add_argument(
-        "--skip",
-        action="append",
-        default=[],
-        metavar="STAGE",
-        help=f"leave a stage out ({', '.join(IMAGE_TO_ASSET.skippable)}); may be repeated",
-    )
-    job.add_argument(
         "--force",
         action="append",
         default=[],
         metavar="STAGE",
         help="recompute a stage though nothing changed; may be repeated",
     )
-    _add_machine(job)
+    add_timeout(job)
+    add_share(job)
+    add_machine(job)
     return job
 
 
-def _add_photo(job: argparse.ArgumentParser) -> None:
+def add_share(parser: argparse.ArgumentParser) -> None:
+    """The option for a store that machines share."""
+    parser.add_argument(
+        "--share",
+        metavar="URL",
+        help="also fetch artifacts from, and publish them to, a store that other machines use: "
+        "file:///mnt/..., s3://bucket/... (pip install 'svim3d[s3]'), or what else fsspec knows",
+    )
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Preset, single settings, and what is left out."""
+    parser.add_argument(
+        "--preset", default="standard", help="preview, standard or paper (%(default)s)"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="STAGE.NAME=VALUE",
+        help="change one setting; may be repeated",
+    )
+    parser.add_argument(
+        "--skip",
+        action="append",
+        default=[],
+        metavar="STAGE",
+        help=f"leave a stage out ({', '.join(IMAGE_TO_ASSET.skippable)}); may be repeated",
+    )
+
+
+def add_timeout(parser: argparse.ArgumentParser) -> None:
+    """The option for time limits; `flows.limits` reads it."""
+    parser.add_argument(
+        "--timeout",
+        action="append",
+        default=[],
+        metavar="[STAGE=]SECONDS",
+        help="stop a stage (without a name: any) that runs longer; what it has done so far is "
+        "kept; may be repeated",
+    )
+
+
+def add_photo(job: argparse.ArgumentParser) -> None:
     """Short forms of settings that most photos are run with."""
     photo = job.add_argument_group("photos")
     photo.add_argument(
@@ -106,7 +135,7 @@ def relight_options() -> argparse.ArgumentParser:
     )
     _add_light_and_paint(options)
     _add_rendering(options)
-    _add_machine(options)
+    add_machine(options)
     options.add_argument("--force", action="store_true", help="compute again though it is there")
     return options
 
@@ -200,7 +229,7 @@ def _add_rendering(options: argparse.ArgumentParser) -> None:
     views.add_argument("--fov", type=float, metavar="DEG", help="vertical, of those cameras (33.8)")
 
 
-def _add_machine(parser: argparse.ArgumentParser) -> None:
+def add_machine(parser: argparse.ArgumentParser) -> None:
     """What decides how numbers come about, shared by all commands that compute."""
     parser.add_argument("--seed", type=int, default=0, help="of all random numbers (%(default)s)")
     parser.add_argument(

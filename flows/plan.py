@@ -1,6 +1,6 @@
 """What a run will do, stage by stage, and why: known before anything is computed or imported."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cache
@@ -168,8 +168,21 @@ def make_plan(
     seed: int,
     store: Store,
     selection: Selection,
+    code: Callable[[str], dict[str, str]] = code_digests,
+    explained: bool = True,
 ) -> Plan:
     """Look up every stage in the store and say why those that are missing are.
+
+    Args:
+        pipeline: stages and products.
+        config: settings of all stages.
+        source: the input from outside.
+        seed: of the run.
+        store: where artifacts are.
+        selection: which part is asked for.
+        code: the digests of a module and of what it imports.
+        explained: whether to look for the nearest artifact of each that is missing, which reads
+            hundreds of manifests.
 
     Raises:
         InputError: the input is not there or of no use, the wishes contradict each other, or
@@ -180,8 +193,8 @@ def make_plan(
     selection.check(pipeline)
     idle = {node.name for node in pipeline.nodes if not node.has_work_for(source)}
     selection.check_idle(idle, source)
-    recipes = _recipes(pipeline, config, source, seed, selection.skip | idle)
-    explain = _Explainer(store)
+    recipes = _recipes(pipeline, config, source, seed, selection.skip | idle, code)
+    explain = _Explainer(store) if explained else _call_missing
     steps = []
     for node in pipeline.nodes:
         recipe = recipes.get(node.name)
@@ -194,7 +207,12 @@ def make_plan(
 
 
 def _recipes(
-    pipeline: Pipeline, config: RunConfig, source: Path, seed: int, skip: Iterable[str]
+    pipeline: Pipeline,
+    config: RunConfig,
+    source: Path,
+    seed: int,
+    skip: Iterable[str],
+    code: Callable[[str], dict[str, str]],
 ) -> dict[str, Recipe]:
     """Recipes of all stages that are not skipped: each names its inputs by their keys."""
     keys: dict[str, str] = {SOURCE: digest_input(source)}
@@ -209,7 +227,7 @@ def _recipes(
             config=getattr(config, node.name).model_dump(mode="json"),
             seed=seed,
             inputs={name: keys[name] for name in node.inputs},
-            code=code_digests(node.module),
+            code=code(node.module),
             versions=versions,
         )
         keys[node.name] = recipes[node.name].key
@@ -222,7 +240,7 @@ def _step(
     pipeline: Pipeline,
     selection: Selection,
     store: Store,
-    explain: "_Explainer",
+    explain: Callable[[Recipe], str],
 ) -> Step:
     if recipe is None:
         return Step(node, Verdict.SKIPPED, "left out by --skip or the preset", None, None)
@@ -259,6 +277,10 @@ def _ancestors(pipeline: Pipeline, name: str) -> set[str]:
             found.add(upstream)
             queue.extend(inputs[upstream])
     return found
+
+
+def _call_missing(_: Recipe) -> str:
+    return "not in the store"
 
 
 class _Explainer:

@@ -1,7 +1,7 @@
 """One step of a plan, computed or found; whoever runs it, an engine or a command."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
@@ -38,12 +38,14 @@ class Bench:
         store: where artifacts are.
         device: where to compute.
         observer: who watches.
+        limits_s: seconds after which a stage is stopped, by its name; others have no limit.
     """
 
     plan: Plan
     store: Store
     device: torch.device
     observer: Observer
+    limits_s: Mapping[str, float] = field(default_factory=dict)
 
 
 def obtain_step(step: Step, upstream: Mapping[str, Stored], bench: Bench) -> Stored:
@@ -71,6 +73,7 @@ def _compute(step: Step, upstream: Mapping[str, Stored], bench: Bench) -> Stored
             config=getattr(bench.plan.config, step.node.name),
             device=bench.device,
             force=step.stored is not None,
+            limit_s=bench.limits_s.get(step.node.name),
             on_progress=bench.observer.progressed,
         )
     except Exception as error:

@@ -4,11 +4,9 @@ Tasks are thin. They return a reference to the store, Prefect keeps no result, a
 cache only: the store.
 """
 
-import errno
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
-import torch
 from prefect import Task, task
 from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State, TaskRun
@@ -16,28 +14,18 @@ from prefect.states import Completed
 
 from flows.plan import Step
 from flows.steps import Bench, obtain_step
-from stages.errors import TransientError
+from stages.faults import kind_of
 from stages.store import Stored
 
-RETRY_DELAYS_S = (1.0, 5.0)  # a moment for memory to be freed, then for a mount to come back
-# What a file system says when it is away for a while, as against a path that is wrong.
-PASSING_FAULTS = frozenset(
-    {errno.EIO, errno.EAGAIN, errno.EBUSY, errno.ESTALE, errno.ETIMEDOUT, errno.ENOMEM}
-)
-
-
-def is_transient(error: BaseException) -> bool:
-    """Whether the same attempt may succeed later: memory or a file system that was away."""
-    if isinstance(error, OSError):
-        return error.errno in PASSING_FAULTS
-    return isinstance(error, TransientError | MemoryError | torch.OutOfMemoryError)
+# A moment for memory to be freed, then growing ones for a mount to come back.
+RETRY_DELAYS_S = (1.0, 4.0, 16.0)
 
 
 def _should_retry(_: Task[..., Any], __: TaskRun, state: State[Any]) -> bool:
     try:
         state.result()
     except Exception as error:
-        return is_transient(error)
+        return kind_of(error).is_passing
     return False
 
 

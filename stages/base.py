@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 CHECKPOINT_EVERY_S = 20.0  # a killed stage loses at most this much work
 MAX_NON_FINITE_STEPS = 20  # beyond this the optimisation is diverging, not hiccuping
 NON_FINITE_STEP = "non_finite_step"  # kind of the event that such a step leaves
+OUT_OF_MEMORY = "out_of_memory"  # kind of the event that an attempt leaves which ran out of it
+MIN_CHUNK = 1024  # smaller ones save little memory, and calls begin to cost more than work
 
 
 class Artifact(Protocol):
@@ -164,19 +166,37 @@ class Context:
         digest = hashlib.sha256(f"{self.seed}/{self.stage}/{name}".encode()).digest()
         return torch.Generator(device=device).manual_seed(int.from_bytes(digest[:7], "big"))
 
-    def event(self, kind: str, message: str) -> None:
+    def event(self, kind: str, message: str, *, tell: bool = True) -> None:
         """Record something the operator should know and the manifest must keep.
 
         The record outlives a killed process; a resumed one that meets the same event again (name
         the step in the message) does not repeat it.
+
+        Args:
+            kind: a word for programs.
+            message: for people.
+            tell: whether to warn now, besides.
         """
         entry = {"kind": kind, "message": message}
         if entry in self.events:
             return
-        log.warning("%s: %s", self.stage, message)
+        if tell:
+            log.warning("%s: %s", self.stage, message)
         self.events.append(entry)
         with self._event_log.open("a") as stream:
             stream.write(json.dumps(entry) + "\n")
+
+    def count(self, kind: str) -> int:
+        """How many events of a kind there were, in earlier attempts too."""
+        return sum(entry["kind"] == kind for entry in self.events)
+
+    def chunk(self, most: int) -> int:
+        """How many items to work on at a time: `most`, halved for each time that memory ran out.
+
+        For what gives the same result in pieces of any size, to rounding: the size is no part of
+        the artifact's key.
+        """
+        return max(min(most, MIN_CHUNK), most >> self.count(OUT_OF_MEMORY))
 
     def report(self, step: int, total: int, terms: Mapping[str, float]) -> None:
         """Append scalars to `scalars.csv` and show progress; cheap enough for every step.
@@ -217,8 +237,7 @@ class Context:
         if not bad:
             return True
         self.event(NON_FINITE_STEP, f"step {step} skipped: non-finite {', '.join(bad)}")
-        skipped = sum(entry["kind"] == NON_FINITE_STEP for entry in self.events)
-        if skipped > MAX_NON_FINITE_STEPS:
+        if self.count(NON_FINITE_STEP) > MAX_NON_FINITE_STEPS:
             self.checkpoints.discard()
             self._event_log.unlink(missing_ok=True)
             raise DivergenceError(

@@ -1,5 +1,6 @@
 """Run one stage against the store: load its inputs, measure it, save what it returns."""
 
+import contextlib
 import os
 import platform
 import resource
@@ -7,18 +8,28 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from stages.base import Artifact, Context, Progress, Stage
+from stages.base import OUT_OF_MEMORY, Artifact, Context, Progress, Stage
+from stages.device_slot import device_slot
 from stages.errors import InputError
+from stages.faults import Fault, kind_of
 from stages.keys import Recipe
 from stages.settings.base import StageConfig
 from stages.store import Store, Stored
+from stages.time_limit import time_limit
 
+# Faults that leave a trace in the artifact which comes about in spite of them.
+EVENT_KINDS = {
+    Fault.MEMORY: OUT_OF_MEMORY,
+    Fault.FILES: "io_fault",
+    Fault.BUSY: "transient_fault",
+    Fault.TIME: "timeout",
+}
 PROJECT = Path(__file__).resolve().parents[1]
 
 
@@ -43,6 +54,7 @@ def run_stage(
     config: StageConfig,
     device: torch.device,
     force: bool = False,
+    limit_s: float | None = None,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Stored:
     """The artifact of `recipe`, made by `stage` if the store has none.
@@ -56,29 +68,55 @@ def run_stage(
         config: the stage's settings, the same as in the recipe.
         device: where to compute.
         force: run though the store has it.
+        limit_s: seconds after which the stage is stopped.
         on_progress: told how far the stage is.
     """
 
     def compute(payload: Path, work: Path) -> dict[str, Any]:
-        start, cpu_start = time.monotonic(), time.process_time()
-        _reset_peak_memory(device)
-        with Context(
-            recipe.stage, device, recipe.seed, work, store.shared, on_progress=on_progress
-        ) as ctx:
-            artifact: Artifact = stage.run(*_load(stage, inputs), config=config, ctx=ctx)
-            artifact.save(payload)
-        return {
-            "seconds": round(time.monotonic() - start, 3),
-            "cpu_seconds": round(time.process_time() - cpu_start, 3),
-            "peak_memory_mib": _peak_memory_mib(device),
-            "headline": artifact.headline(),
-            "events": ctx.events,
-            # The key names the recipes of the inputs; this names the bytes that were consumed.
-            "consumed": {n: i.manifest.seal for n, i in inputs.items() if isinstance(i, Stored)},
-            **_surroundings(device),
-        }
+        with device_slot(device):
+            start, cpu_start = time.monotonic(), time.process_time()
+            _reset_peak_memory(device)
+            with (
+                Context(
+                    recipe.stage, device, recipe.seed, work, store.shared, on_progress=on_progress
+                ) as ctx,
+                _faults_noted(ctx),
+                time_limit(limit_s, recipe.stage),
+            ):
+                artifact: Artifact = stage.run(*_load(stage, inputs), config=config, ctx=ctx)
+                artifact.save(payload)
+            return {
+                "seconds": round(time.monotonic() - start, 3),
+                "cpu_seconds": round(time.process_time() - cpu_start, 3),
+                "peak_memory_mib": _peak_memory_mib(device),
+                "headline": artifact.headline(),
+                "events": ctx.events,
+                # The key names the inputs' recipes; this names the bytes that were consumed.
+                "consumed": {
+                    n: i.manifest.seal for n, i in inputs.items() if isinstance(i, Stored)
+                },
+                **_surroundings(device),
+            }
 
     return store.obtain(recipe, compute, force=force)
+
+
+@contextlib.contextmanager
+def _faults_noted(ctx: Context) -> Iterator[None]:
+    """Leave a note of a passing fault for the next attempt, and for the manifest."""
+    try:
+        yield
+    except Exception as error:
+        fault = kind_of(error)
+        if kind := EVENT_KINDS.get(fault):
+            number = ctx.count(kind) + 1
+            first_line = str(error).partition("\n")[0] or type(error).__name__
+            message = f"attempt that failed, number {number}: {fault} ({first_line})"
+            with contextlib.suppress(OSError):  # the fault may be the folder's own
+                ctx.event(kind, message, tell=False)  # whoever watches is told of the exception
+        if ctx.device.type == "cuda" and fault is Fault.MEMORY:
+            torch.cuda.empty_cache()
+        raise
 
 
 def _load(stage: Stage, inputs: Mapping[str, Stored | Path | None]) -> list[Any]:

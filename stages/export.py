@@ -98,9 +98,10 @@ def _colored(fitted: RefinedSurface, config: ExportConfig, ctx: Context) -> Text
     geometric = vertex_normals(coarse.vertices, coarse.faces)
     materials = fitted.material_field(ctx.device)
     colors, orms, normals = [], [], []
+    size = ctx.chunk(POINTS_PER_CHUNK)
     with torch.no_grad():
-        for low in range(0, len(geometric), POINTS_PER_CHUNK):
-            part = slice(low, low + POINTS_PER_CHUNK)
+        for low in range(0, len(geometric), size):
+            part = slice(low, low + size)
             found = materials(coarse.vertices[part].to(ctx.device))
             colors.append(found.basecolor.cpu())
             open_sky = torch.ones_like(found.roughness)

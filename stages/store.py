@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from stages.errors import InputError, TransientError
+from stages.errors import FullError, InputError, TransientError
 from stages.keys import Recipe
 from stages.manifest import Manifest
 
@@ -231,7 +231,7 @@ class Store:
     def _require_space(self) -> None:
         free_mib = shutil.disk_usage(self.root).free / 2**20
         if free_mib < MIN_FREE_MIB:
-            raise TransientError(
+            raise FullError(
                 f"only {free_mib:.0f} MiB are free where the store {self.root} lies, "
                 f"{MIN_FREE_MIB} MiB are wanted; free some space or choose another --store"
             )
@@ -274,7 +274,7 @@ class Store:
             yield
         except Exception as error:
             if is_disk_full(error):
-                raise TransientError(
+                raise FullError(
                     f"no space left where the store {self.root} lies; free some space "
                     "or choose another --store, then run again: finished work is kept"
                 ) from error

@@ -64,7 +64,7 @@ def run(
     mesh, texels = _unwrapped(coarse, config, ctx)
     ctx.report(2, 4, {"vertices": len(mesh.vertices), "texels": len(texels.pixel)})
 
-    values = _bake(mesh, texels, fine, fitted, ctx.device)
+    values = _bake(mesh, texels, fine, fitted, ctx)
     ctx.report(3, 4, {})
     openness = _openness(mesh, field, config.occlusion_rays)
     values = torch.cat([values, texels.interpolate(mesh.faces, openness)], 1)
@@ -123,7 +123,7 @@ def _bake(
     texels: Texels,
     fine: CleanMesh,
     fitted: RefinedSurface,
-    device: torch.device,
+    ctx: Context,
 ) -> Float[Tensor, "P 8"]:
     """Basecolor (linear), roughness, metallic and tangent-space normal of every texel.
 
@@ -142,12 +142,12 @@ def _bake(
     hits = project_onto(points, normal, fine.vertices, fine.faces)
     points = hits.interpolate(fine.faces, fine.vertices)
     geometric = hits.interpolate(fine.faces, vertex_normals(fine.vertices, fine.faces))
-    materials = fitted.material_field(device)
-    chunks = []
+    materials = fitted.material_field(ctx.device)
+    chunks, size = [], ctx.chunk(POINTS_PER_CHUNK)
     with torch.no_grad():
-        for low in range(0, len(points), POINTS_PER_CHUNK):
-            part = slice(low, low + POINTS_PER_CHUNK)
-            found = materials(points[part].to(device))
+        for low in range(0, len(points), size):
+            part = slice(low, low + size)
+            found = materials(points[part].to(ctx.device))
             shading = normalize(normalize(geometric[part]) + found.bump.cpu())
             local = tangent_from_world(shading, normal[part], tangent[part], bitangent[part])
             surface = torch.cat([found.basecolor, found.roughness, found.metallic], 1).cpu()

@@ -65,7 +65,18 @@ MAY_IMPORT = {
         "stages.manifest",
         "stages.errors",
     ),
-    "stages.execution": (*CONTRACT, "stages.keys", "stages.store"),
+    "stages.shared_store": ("stages.store", "stages.keys", "stages.manifest", "stages.errors"),
+    "stages.faults": ("stages.errors", "stages.store"),
+    "stages.time_limit": ("stages.errors",),
+    "stages.device_slot": (),
+    "stages.execution": (
+        *CONTRACT,
+        "stages.keys",
+        "stages.store",
+        "stages.faults",
+        "stages.time_limit",
+        "stages.device_slot",
+    ),
     "flows": ("flows", "stages"),
 }
 # Inside svim3d a unit of the middle tier sees itself and the basics.
@@ -74,6 +85,10 @@ UNITS = {name: f"svim3d.{name}" for name in (*MIDDLE, "render", "synthesis", "io
 # One library, one door.
 DOORS = {
     "prefect": ("flows",),
+    "prefect_dask": ("flows.batch_flow",),
+    "prefect_ray": ("flows.batch_flow",),
+    "fsspec": ("stages.shared_store",),
+    "cloudpickle": ("flows.workers",),
     "uvicorn": ("flows.engine_server",),
     "rich": ("flows",),
     "pydantic": ("flows", "stages.settings"),
@@ -102,6 +117,12 @@ DOORS = {
 }
 # What a plan and `--help` load: no torch, no Prefect at the top of these modules.
 LIGHT = (
+    "flows.batch",
+    "flows.batch_inputs",
+    "flows.batch_job",
+    "flows.batch_options",
+    "flows.batch_results",
+    "flows.workers",
     "flows.cli",
     "flows.commands",
     "flows.config",
@@ -111,6 +132,7 @@ LIGHT = (
     "flows.edit",
     "flows.engine",
     "flows.job",
+    "flows.limits",
     "flows.model",
     "flows.model_options",
     "flows.operator_options",
@@ -128,6 +150,7 @@ LIGHT = (
     "stages.keys",
     "stages.locks",
     "stages.manifest",
+    "stages.shared_store",
     "stages.store",
     "stages.store_archive",
     "stages.store_cleaning",

@@ -81,6 +81,9 @@ def test_doctor_describes_the_machine_and_finds_damage(tmp_path, source, capsys)
         (["plan", "SOURCE", "--preset", "fast"], "choose one of preview, standard, paper"),
         (["run", "SOURCE", "--skip", "total"], "--skip total: later stages need it"),
         (["run", "SOURCE", "--only", "walk"], "use --until walk"),
+        (["run", "SOURCE", "--timeout", "walc=3"], "--timeout walc=3: no such stage"),
+        (["run", "SOURCE", "--timeout", "walk=0"], "--timeout walk=0: wanted seconds"),
+        (["run", "SOURCE", "--timeout", "soon"], "--timeout soon: wanted seconds"),
     ],
 )
 def test_bad_usage_is_one_line_and_code_2(arguments, complaint, source, tmp_path, capsys):

@@ -97,6 +97,11 @@ def test_computed_and_cached_stages_show_as_such(engine, store, source):
 def test_passing_faults_are_tried_again(engine, store, source, fault):
     watcher, artifacts = execute(store, source, f"walk.fault={fault}", "walk.faults=2")
     assert watcher.count("failed", "walk") == 2 and "total" in artifacts
+    # Each attempt that failed shows in the manifest, and with it in the run's table.
+    kinds = [event["kind"] for event in artifacts["walk"].manifest.record["events"]]
+    assert kinds == 2 * [
+        {"transient": "transient_fault", "io": "io_fault"}.get(fault, "out_of_memory")
+    ]
 
 
 def test_tries_have_an_end(engine, store, source):
@@ -199,6 +204,17 @@ def test_failed_command_says_why_in_a_line(
     assert tiny_command.main(given) == code
     errors = capsys.readouterr().err
     assert complaint in errors and "Traceback" not in errors
+
+
+def test_stage_past_its_limit_is_stopped_once_and_goes_on(engine, store, source, tmp_path, capsys):
+    command = ["run", str(source), "-o", str(tmp_path / "out"), "--store", str(store.root)]
+    slow = ["--set", "walk.steps=40", "--set", "walk.pause_s=0.05"]
+    assert tiny_command.main([*command, *slow, "--timeout", "walk=0.5"]) == cli.FAILED
+    assert "walk was stopped after its 0.5 s" in capsys.readouterr().err
+    assert tiny_command.main([*command, *slow, "--timeout", "60"]) == cli.DONE
+    events = json.loads((tmp_path / "out" / "run.json").read_text())["stages"]["walk"]["events"]
+    assert [event["kind"] for event in events] == ["timeout", "resumed"]
+    assert "attempt" in capsys.readouterr().out  # in the table
 
 
 def test_server_goes_with_its_parent_however_that_ends(tmp_path):

@@ -10,5 +10,5 @@ class WalkConfig(StageConfig):
 
     steps: int = 40
     pause_s: float = 0.0
-    fault: Literal["", "transient", "memory", "cuda memory", "io", "input", "defect"] = ""
+    fault: Literal["", "transient", "memory", "cuda memory", "io", "input", "defect", "killed"] = ""
     faults: int = 1

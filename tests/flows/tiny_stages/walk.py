@@ -1,6 +1,8 @@
 """A long stage: a random walk that checkpoints every few steps, and fails when told to."""
 
 import errno
+import os
+import signal
 import time
 from pathlib import Path
 
@@ -44,6 +46,8 @@ def _fail(config: WalkConfig, attempts: Path) -> None:
         with attempts.open("a") as stream:
             stream.write("x")
         if attempts.stat().st_size <= config.faults:
+            if config.fault == "killed":
+                os.kill(os.getpid(), signal.SIGKILL)
             raise FAULTS[config.fault]
 
 
