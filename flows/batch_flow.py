@@ -10,6 +10,7 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State
 from prefect.context import hydrated_context, serialize_context
+from prefect.exceptions import FailedRun
 from prefect.futures import as_completed
 from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
 from prefect.states import Completed, Failed
@@ -68,12 +69,20 @@ def make_runner(name: str, jobs: int, address: str | None) -> TaskRunner[Any]:
 
 
 def run_batch(batch: Batch, runner: TaskRunner[Any], name: str) -> None:
-    """Carry a batch out; what its inputs come to is told, not raised."""
+    """Carry a batch out; what its inputs come to is told, not raised.
+
+    Raises:
+        Exception: what kept the batch itself from going on.
+    """
     token = _batch.set(batch)
     try:
         with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
             batch_flow = _run_inputs.with_options(task_runner=runner, flow_run_name=name)
-            batch_flow(inputs=len(batch.jobs), return_state=True)
+            state = batch_flow(inputs=len(batch.jobs), return_state=True)
+            error = None if state.is_completed() else state.result(raise_on_failure=False)
+            # Inputs that failed leave the state that was returned, other faults their exception.
+            if isinstance(error, BaseException) and not isinstance(error, FailedRun):
+                raise error
     finally:
         _batch.reset(token)
 

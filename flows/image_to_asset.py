@@ -10,8 +10,8 @@ from prefect.events.worker import EventsWorker
 from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
 
 from flows.plan import Verdict
-from flows.steps import Bench
-from flows.tasks import RETRY_DELAYS_S, run_step
+from flows.steps import RETRY_DELAYS_S, Bench
+from flows.tasks import run_step
 from stages.store import Stored
 
 RECORD_TIMEOUT_S = 3.0  # the server writes what tasks did a moment after they did it

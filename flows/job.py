@@ -140,7 +140,7 @@ def compute_under_engine(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[
 
 def compute_here(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[str, Any]]:
     """Run the plan's steps one after the other in this process, without an engine."""
-    from flows.steps import Bench, obtain_step
+    from flows.steps import Bench, obtain_step_patiently
     from stages.execution import choose_device
 
     artifacts: dict[str, Stored] = {}
@@ -149,7 +149,7 @@ def compute_here(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[str, Any
         bench = Bench(plan, job.store, device, observer, job.limits_s)
         for step in plan.steps:
             if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):
-                artifacts[step.node.name] = obtain_step(step, artifacts, bench)
+                artifacts[step.node.name] = obtain_step_patiently(step, artifacts, bench)
     return artifacts, {}
 
 

@@ -1,6 +1,7 @@
 """One step of a plan, computed or found; whoever runs it, an engine or a command."""
 
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -10,7 +11,11 @@ from flows.pipeline import SOURCE
 from flows.plan import Plan, Step, Verdict
 from stages.base import Progress
 from stages.execution import run_stage
+from stages.faults import kind_of
 from stages.store import Store, Stored
+
+# A moment for memory to be freed, then growing ones for a mount to come back.
+RETRY_DELAYS_S = (1.0, 4.0, 16.0)
 
 
 class Observer(Protocol):
@@ -55,6 +60,23 @@ def obtain_step(step: Step, upstream: Mapping[str, Stored], bench: Bench) -> Sto
         stored = _compute(step, upstream, bench)
     bench.observer.finished(step, stored)
     return stored
+
+
+def obtain_step_patiently(
+    step: Step,
+    upstream: Mapping[str, Stored],
+    bench: Bench,
+    retry_delays_s: Sequence[float] = RETRY_DELAYS_S,
+) -> Stored:
+    """`obtain_step`, tried again after passing faults, as tasks of an engine are."""
+    for delay_s in retry_delays_s:
+        try:
+            return obtain_step(step, upstream, bench)
+        except Exception as error:
+            if not kind_of(error).is_passing:
+                raise
+        time.sleep(delay_s)
+    return obtain_step(step, upstream, bench)
 
 
 def _compute(step: Step, upstream: Mapping[str, Stored], bench: Bench) -> Stored:

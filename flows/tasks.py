@@ -17,9 +17,6 @@ from flows.steps import Bench, obtain_step
 from stages.faults import kind_of
 from stages.store import Stored
 
-# A moment for memory to be freed, then growing ones for a mount to come back.
-RETRY_DELAYS_S = (1.0, 4.0, 16.0)
-
 
 def _should_retry(_: Task[..., Any], __: TaskRun, state: State[Any]) -> bool:
     try:

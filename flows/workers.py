@@ -171,7 +171,7 @@ class _Worker:
 
 def _obituary(code: int | None, times: int) -> str:
     if code == OVER_TIME:
-        return "the process that computed it was ended: it ran past its time and did not listen"
+        return "the process that computed it ended with code 1, as by --timeout in the last resort"
     how = f"by signal {signal.Signals(-code).name}" if code and code < 0 else f"with code {code}"
     memory = "; is there enough memory?" if code == -signal.SIGKILL else ""
     return f"the process that computed it ended {how}, {times} times{memory}"
@@ -193,10 +193,19 @@ def _serve(connection: Connection, threads: int | None) -> None:
             try:
                 answer = _Answer(function())
             except Exception as error:
-                answer = _Answer(error=error)
+                answer = _Answer(error=_portable(error))
             connection.send_bytes(cloudpickle.dumps(answer))
     except (EOFError, OSError, KeyboardInterrupt):
         return
+
+
+def _portable(error: Exception) -> Exception:
+    """An exception that arrives: not all can be pickled, and not all of those be made again."""
+    try:
+        cloudpickle.loads(cloudpickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error
 
 
 def _follow_parent() -> None:

@@ -7,8 +7,10 @@ import time
 import pytest
 import tiny_batch
 from tiny_batch import rows, states
+from tiny_pipeline import TINY, TinyConfig
 
 from flows import cli
+from flows.batch_job import JobError
 from stages.store import Store
 
 pytestmark = pytest.mark.flow
@@ -80,6 +82,31 @@ def _require_subflows() -> None:
             assert time.monotonic() < deadline, [(run.name, run.state_name) for run in runs]
             time.sleep(0.2)
     assert {run.name for run in below} >= {"a-seed0", "a-seed1", "broken-seed0", "lost-seed0"}
+
+
+def test_fault_of_the_batch_itself_is_raised(engine, tmp_path):
+    from flows.batch_flow import Batch, make_runner, run_batch
+    from flows.batch_job import BatchJob
+
+    def tell(job, outcome):
+        assert isinstance(outcome, JobError) and "does not exist" in outcome.message
+        raise OSError("the table cannot be written")
+
+    job = BatchJob(
+        name="gone",
+        pipeline=TINY,
+        schema=TinyConfig,
+        source=tmp_path / "gone.txt",
+        out=tmp_path / "out",
+        preset="standard",
+        overrides=(),
+        skip=frozenset(),
+        seed=0,
+        device="cpu",
+        store=tmp_path / "store",
+    )
+    with pytest.raises(OSError, match="the table cannot be written"):
+        run_batch(Batch([job], tell, workers=None), make_runner("local", 1, None), "faulty")
 
 
 def test_cancelled_batch_leaves_what_it_did_and_goes_on(engine, tmp_path):
