@@ -14,6 +14,7 @@ from pathlib import Path
 from flows.data_options import data_options
 from flows.model_options import model_options
 from flows.options import edit_options, job_options, photo_settings, relight_options
+from flows.serve_options import serve_options
 from flows.train_options import train_options
 
 DONE, FAILED, BAD_INPUT, CANCELLED = 0, 1, 2, 130
@@ -76,6 +77,10 @@ def _dispatch(options: argparse.Namespace) -> int:
         from flows.model import model
 
         return model(options)
+    if options.command == "serve":
+        from flows.serve import serve
+
+        return serve(options)
     from flows import commands
 
     if options.command == "presets":
@@ -121,6 +126,7 @@ def _parser() -> argparse.ArgumentParser:
         ("data", [data_options(), shared], "render training data for the generator"),
         ("model", [model_options(shared)], "convert a checkpoint, or tell what a model holds"),
         ("plan", [job, shared], "say which stages a run would compute, and why"),
+        ("serve", [serve_options(), shared], "take pictures over HTTP and make assets of them"),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
     ):
