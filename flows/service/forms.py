@@ -23,10 +23,21 @@ SETTING_OF = {
 MAX_SEED = 2**31 - 1
 
 
+def _as_sent(schema: dict[str, Any]) -> None:
+    """Let the document say what a form can: a field is there or not, but never null."""
+    for field in schema["properties"].values():
+        variants = field.pop("anyOf", None)
+        if variants is not None:
+            field |= next(variant for variant in variants if variant["type"] != "null")
+        if field.get("default", ...) is None:
+            del field["default"]
+    schema["oneOf"] = [{"required": ["picture"]}, {"required": ["views"]}]
+
+
 class JobForm(BaseModel):
     """A picture or views, and a few settings. What is left out is the preset's."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", json_schema_extra=_as_sent)
 
     picture: UploadFile | None = Field(
         None, description="a photo of one object: PNG, JPEG, WebP, TIFF, BMP or GIF"

@@ -5,7 +5,6 @@ import json
 import stat
 import struct
 import tracemalloc
-import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -13,17 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_service import png, send
+from fake_views import POSE, SIZE, exr, index, packed
 from PIL import Image
 
 from flows.service import api
 from flows.service.limits import ArchiveLimits
 from flows.service.problems import Refusal
 from flows.service.uploads import keep_views
-from svim3d.io.exr import write_exr
 from svim3d.io.orbit import read_orbit
-
-POSE = np.eye(4).tolist()
-SIZE = 8
 
 
 def picture_claiming(width: int, height: int) -> bytes:
@@ -88,33 +84,6 @@ def test_a_request_that_hides_its_length_is_counted(serving):
         )
         assert sent.status_code == 413 and sent.json()["code"] == "upload_too_large"
         send(client)
-
-
-def exr(tmp_path: Path, height: int = SIZE, width: int = SIZE) -> bytes:
-    names = ("R", "G", "B", "A", "basecolor.R", "basecolor.G", "basecolor.B")
-    names += ("roughness.V", "metallic.V", "normal.X", "normal.Y", "normal.Z")
-    plane = np.full((height, width), 0.5, np.float32)
-    planes = {name: plane for name in names} | {"normal.X": plane * 0, "normal.Y": plane * 0}
-    write_exr(tmp_path / "one.exr", planes | {"normal.Z": plane * 0 + 1})
-    return (tmp_path / "one.exr").read_bytes()
-
-
-def index(files: list[str], **more) -> bytes:
-    camera = {"width": SIZE, "height": SIZE, "fov_deg": 33.8}
-    frames = [{"file": file, "c2w": POSE} for file in files]
-    return json.dumps({"camera": camera, "frames": frames, **more}).encode()
-
-
-def packed(
-    entries: dict[str | zipfile.ZipInfo, bytes], how: int = zipfile.ZIP_DEFLATED
-) -> io.BytesIO:
-    buffer = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of two entries of one name
-        with zipfile.ZipFile(buffer, "w", how) as archive:
-            for name, content in entries.items():
-                archive.writestr(name, content)
-    return buffer
 
 
 def keep(buffer: io.BytesIO, folder: Path, **limits) -> Path:
