@@ -19,6 +19,7 @@ from flows.service.problems import Problem, Refusal, answer_problems
 from flows.service.queue import JobQueue
 from flows.service.records import ID_PATTERN, Record
 from flows.service.uploads import keep_picture, keep_views
+from stages.store import FULL_DISK
 
 ABOUT = """A photo of one object in, a relightable 3D asset out.
 
@@ -29,7 +30,8 @@ Send a picture with `POST /jobs`, ask `GET /jobs/{id}` until its `state` is `don
 
 Whatever is refused is answered by one shape, `Problem`: what was wanted, what came, what to do.
 """
-NEVER_CACHED = {"Cache-Control": "no-store"}
+# A removed job's file must not be shown from a cache; one that is there need not be sent again.
+ASKED_AGAIN = {"Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
 MAX_PAGE = 100
 ONE_RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{0,18})|-(\d{1,18}))")
 MEDIA_TYPES = {
@@ -48,6 +50,7 @@ MEANINGS = {
     415: "the upload is not of a kind that can be used",
     416: "the file is shorter than where the range begins",
     422: "a value does not fit",
+    507: "the disk is full",
     503: "the queue is full; `Retry-After` says when to come back",
 }
 
@@ -92,7 +95,7 @@ class _Endpoints:
         """All of them, with what each may answer."""
         router = APIRouter()
         add = router.add_api_route
-        sent = _problems(400, 403, 408, 413, 415, 422, 503)
+        sent = _problems(400, 403, 408, 413, 415, 422, 503, 507)
         add("/jobs", self.send, methods=["POST"], status_code=202, responses=sent, tags=["jobs"])
         add("/jobs", self.page, methods=["GET"], responses=_problems(422), tags=["jobs"])
         found = _problems(404, 422)
@@ -159,7 +162,18 @@ class _Endpoints:
                 created=time.time(),
             )
 
-        record = self._queue.submit(fill)
+        try:
+            record = self._queue.submit(fill)
+        except OSError as error:
+            if error.errno not in FULL_DISK:
+                raise
+            raise Refusal(
+                HTTPStatus.INSUFFICIENT_STORAGE,
+                "disk_full",
+                wanted="room for the upload",
+                came="a full disk",
+                todo="tell the operator; removing finished jobs makes some room",
+            ) from error
         response.headers["Location"] = f"/jobs/{record.id}"
         return self._view(record)
 
@@ -278,7 +292,7 @@ def _send_file(file: Path, record: Record, request: Request) -> Response:
         )
     return FileResponse(
         file,
-        headers={"ETag": etag, **NEVER_CACHED},
+        headers={"ETag": etag, **ASKED_AGAIN},
         media_type=MEDIA_TYPES[file.name],
         filename=f"{record.id[:8]}-{file.name}",
         stat_result=state,

@@ -1,5 +1,6 @@
 """The service by its answers: a picture's way, results, refusals, nothing of the machine."""
 
+import errno
 import importlib.metadata
 
 import pytest
@@ -7,7 +8,7 @@ from fake_run import BAD, GLB, SILENT, SLOW, STUBBORN
 from fake_service import png, send, wait_for
 
 from flows.config import PipelineConfig, load_config
-from flows.service import queue
+from flows.service import api, queue
 from flows.service.forms import JobForm
 from flows.service.serve import run_options
 
@@ -189,6 +190,16 @@ def test_a_defect_is_told_to_nobody_but_the_log(client, monkeypatch):
     answer = client.get("/jobs")
     assert answer.status_code == 500 and problem(answer)["code"] == "defect"
     assert "ZeroDivision" not in answer.text and "Traceback" not in answer.text
+
+
+def test_a_full_disk_is_told_and_leaves_nothing(client, home, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device", str(home))
+
+    monkeypatch.setattr(api, "keep_picture", full)
+    answer = client.post("/jobs", files={"picture": ("x", png())})
+    assert answer.status_code == 507 and problem(answer)["code"] == "disk_full"
+    assert not list((home / "incoming").iterdir())
 
 
 def test_pages_of_other_sites_are_refused(client):
