@@ -92,6 +92,7 @@ class ProgressView(BaseModel):
         description="what each finished stage has made, in a line",
         examples=[{"prepare": "2.1 s, square of 576 px, object by its alpha"}],
     )
+    notes: list[str] = Field(description="fallbacks that stages took, views they dropped")
 
     @classmethod
     def of(cls, progress: Progress) -> "ProgressView":

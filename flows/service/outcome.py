@@ -14,12 +14,15 @@ from flows.service.problems import strip_paths, without_paths
 
 TAIL_BYTES = 1 << 16  # of a log; a run says a few lines per stage
 MAX_LINE = 400
+MAX_NOTES = 50
 RUN = "run"
 REPORT = "run.json"
 CLOCK_SLACK_S = 1.0  # file systems keep coarse times
 PAGES = "runs"  # where a store keeps a page about each run
 LINE = re.compile(rf"({'|'.join(IMAGE_TO_ASSET.names)}): (.*)")
+# The forms of `flows.console`.
 BEGUN = "computing ("
+FINISHED = re.compile(r"(?:cached|[\d.]+ s), ")
 FAULT = re.compile(r"[A-Z]\w*(?:Error|Exception|Exit|Interrupt): ")
 COMPLAINT = "svim3d: "
 ADVICE = "svim3d: run again"
@@ -36,12 +39,14 @@ class Progress:
         step: of that stage, where it is known.
         total: steps of that stage.
         finished: what each finished stage has made, in a line.
+        notes: what stages had to say: fallbacks taken, views dropped.
     """
 
     stage: str | None
     step: int | None
     total: int | None
     finished: dict[str, str]
+    notes: list[str]
 
 
 def read_progress(folder: Path, store: Path, *, since: float) -> Progress:
@@ -54,21 +59,25 @@ def read_progress(folder: Path, store: Path, *, since: float) -> Progress:
     """
     stage: str | None = None
     finished: dict[str, str] = {}
+    notes = []
     for line in _last_lines(folder):
         found = LINE.fullmatch(line)
-        if found is None or FAULT.match(found[2]):
+        if found is None:
             continue
-        if found[2].startswith(BEGUN):
+        said = without_paths(found[2])[:MAX_LINE]
+        if said.startswith(BEGUN):
             stage = found[1]
             finished.pop(stage, None)
-        else:
-            finished[found[1]] = without_paths(found[2])[:MAX_LINE]
+        elif FINISHED.match(said):
+            finished[found[1]] = said
             stage = None if stage == found[1] else stage
+        elif not FAULT.match(said):  # a fault is told as the job's error, or was mended
+            notes.append(f"{found[1]}: {said}")
     page = _page(folder / RUN, store, since)
     step, total = page.get("step"), page.get("total")
     if page.get("stage") != stage or not isinstance(step, int) or not isinstance(total, int):
         step = total = None
-    return Progress(stage, step, total or None, finished)
+    return Progress(stage, step, total or None, finished, notes[-MAX_NOTES:])
 
 
 def _page(run: Path, store: Path, since: float) -> dict[str, Any]:

@@ -5,7 +5,7 @@ Loads Pillow alone, so that a process which only receives photos stays small.
 
 import warnings
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import Protocol, runtime_checkable
 
 from PIL import Image, UnidentifiedImageError
 
@@ -19,6 +19,20 @@ FORMATS = {
     "BMP": ".bmp",
     "GIF": ".gif",
 }
+
+
+@runtime_checkable
+class Readable(Protocol):
+    """Bytes that can be read from any place: a file, a buffer, an upload."""
+
+    def read(self, size: int = -1, /) -> bytes:
+        """The next bytes."""
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        """Go to a place."""
+
+    def tell(self) -> int:
+        """Tell the place."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +50,7 @@ class PhotoHeader:
     width: int
 
 
-def read_photo_header(stream: BinaryIO) -> PhotoHeader:
+def read_photo_header(stream: Readable) -> PhotoHeader:
     """Format and size of a picture; its pixels are not touched, whatever size they claim.
 
     Args:

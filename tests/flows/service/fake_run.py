@@ -13,6 +13,7 @@ GLB = b"glTF" + bytes(range(200))
 def main(behaviour: int, source: Path, out: Path) -> int:
     print("prepare: computing (nothing there)", flush=True)
     print("prepare: 1.0 s, square of 576 px", flush=True)
+    print(f"prepare: no network in {out}: took the plain background", flush=True)
     if behaviour == STUBBORN:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if behaviour in (SLOW, STUBBORN):

@@ -31,7 +31,13 @@ def test_a_picture_becomes_an_asset(client):
     view = wait_for(client, job, "done")
     assert [event["message"] for event in view["events"]] == ["queued", "started", "done"]
     assert view["settings"] == {"preset": "preview", "seed": 0, "skip": []}
-    assert view["progress"]["finished"] == {"prepare": "cached, square of 576 px"}
+    assert view["progress"] == {
+        "stage": None,
+        "step": None,
+        "total": None,
+        "finished": {"prepare": "cached, square of 576 px"},
+        "notes": ["prepare: no network in run: took the plain background"],
+    }
     fetched = {path.rpartition("/")[2]: client.get(path) for path in view["files"]}
     assert set(fetched) == {"asset.glb", "preview.png", "report"}
     assert fetched["asset.glb"].content == GLB
