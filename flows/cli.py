@@ -17,6 +17,7 @@ from flows.data_options import data_options
 from flows.model_options import model_options
 from flows.operator_options import logs_options, resume_options, status_options, store_options
 from flows.options import edit_options, job_options, photo_settings, relight_options
+from flows.serve_options import serve_options
 from flows.train_options import train_options
 
 DONE, FAILED, BAD_INPUT, CANCELLED = 0, 1, 2, 130
@@ -30,6 +31,7 @@ DOERS = {
     "train": "flows.train",
     "data": "flows.data",
     "model": "flows.model",
+    "serve": "flows.serve",
     "status": "flows.runs",
     "resume": "flows.runs",
     "logs": "flows.runs",
@@ -128,6 +130,7 @@ def _parser() -> argparse.ArgumentParser:
         ("resume", [resume_options(), shared], "carry out again what did not come to its end"),
         ("logs", [logs_options(), shared], "print what the stages of a run said"),
         ("store", [store_options(shared)], "look at the artifacts, clean up, move them"),
+        ("serve", [serve_options(), shared], "take pictures over HTTP and make assets of them"),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
     ):

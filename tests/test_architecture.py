@@ -78,6 +78,8 @@ MAY_IMPORT = {
         "stages.device_slot",
     ),
     "flows": ("flows", "stages"),
+    # What strangers send is looked at before a stage, which loads torch, sees it.
+    "flows.service": ("flows", "stages", "svim3d.io.exr", "svim3d.io.photo_header"),
 }
 # Inside svim3d a unit of the middle tier sees itself and the basics.
 UNITS = {name: f"svim3d.{name}" for name in (*MIDDLE, "render", "synthesis", "io")}
@@ -89,13 +91,15 @@ DOORS = {
     "prefect_ray": ("flows.batch_flow",),
     "fsspec": ("stages.shared_store",),
     "cloudpickle": ("flows.workers",),
-    "uvicorn": ("flows.engine_server",),
+    "uvicorn": ("flows.engine_server", "flows.service.serve"),
+    "fastapi": ("flows.service",),
+    "starlette": ("flows.service",),
     "rich": ("flows",),
     "pydantic": ("flows", "stages.settings"),
     "yaml": ("flows",),
     "OpenEXR": ("svim3d.io.exr",),
     "safetensors": ("svim3d.io.weights",),
-    "PIL": ("svim3d.io.image", "svim3d.io.photo"),
+    "PIL": ("svim3d.io.image", "svim3d.io.photo", "svim3d.io.photo_header"),
     "onnxruntime": ("svim3d.io.matting_network",),
     "imageio_ffmpeg": ("svim3d.io.animation",),
     # A script for an interpreter of its own: nothing imports it.
@@ -146,6 +150,9 @@ LIGHT = (
     "flows.run_records",
     "flows.runs",
     "flows.store",
+    "flows.serve",
+    "flows.serve_options",
+    "flows.service",
     "stages.errors",
     "stages.keys",
     "stages.locks",

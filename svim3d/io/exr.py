@@ -43,17 +43,33 @@ def read_exr(file: Path) -> dict[str, Plane]:
     Raises:
         ValueError: the file is missing, truncated, too large or no EXR.
     """
+    # Without this look at the header, memory is set aside for whatever size it claims.
+    height, width, _ = read_exr_header(file)
     try:
-        # Without this look at the header, memory is set aside for whatever size it claims.
-        with OpenEXR.File(str(file), header_only=True) as image:
-            low, high = image.header()["dataWindow"]
-            width, height = (high.astype(np.int64) - low.astype(np.int64) + 1).tolist()
         check_size(height, width)
         with OpenEXR.File(str(file), separate_channels=True) as image:
             return {
                 name: np.asarray(channel.pixels, np.float32)
                 for name, channel in image.channels().items()
             }
+    except Exception as error:
+        raise ValueError(f"cannot read {file} as OpenEXR: {error}") from error
+
+
+def read_exr_header(file: Path) -> tuple[int, int, int]:
+    """Rows, columns and channels that an EXR claims: of several parts the most, the most, and all.
+
+    Raises:
+        ValueError: the file is missing, cut short within its header or no EXR.
+    """
+    try:
+        with OpenEXR.File(str(file), header_only=True) as image:
+            # Headers are emptied when the file is closed.
+            headers = [image.header(part) for part in range(len(image.parts))]
+            windows = [header["dataWindow"] for header in headers]
+            sizes = [high.astype(np.int64) - low.astype(np.int64) + 1 for low, high in windows]
+            width, height = np.max(sizes, 0).tolist()
+            return height, width, sum(len(header["channels"]) for header in headers)
     except Exception as error:
         raise ValueError(f"cannot read {file} as OpenEXR: {error}") from error
 

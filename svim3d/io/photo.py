@@ -17,11 +17,10 @@ from PIL import Image, ImageCms, UnidentifiedImageError
 from torch import Tensor
 
 from svim3d.io.limits import check_size
+from svim3d.io.photo_header import FORMATS
 
 Notify = Callable[[str, str], None]
 
-# Named, because other decoders of Pillow start programs or fetch things.
-FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")
 WANTED = "wanted a photo (PNG, JPEG, WebP, TIFF, BMP or GIF)"
 MAX_8BIT, MAX_16BIT = 255.0, 65535
 OPACITY_MODES = ("LA", "La", "PA", "RGBA", "RGBa")
@@ -76,7 +75,7 @@ def read_photo(file: Path, notify: Notify, *, longest_px: int) -> Photo:
         with warnings.catch_warnings():
             # Sizes are judged by our own limit; damaged metadata is told where it matters.
             warnings.simplefilter("ignore")
-            with Image.open(file, formats=FORMATS) as picture:
+            with Image.open(file, formats=tuple(FORMATS)) as picture:
                 return _decode(picture, notify, longest_px)
     except UnidentifiedImageError as error:
         raise ValueError(f"{WANTED}, but {file.name} is none; convert it to PNG") from error

@@ -35,7 +35,8 @@ finally:
 
 
 @pytest.mark.parametrize(
-    "command", ["run", "plan", "presets", "doctor", "status", "resume", "logs", "store"]
+    "command",
+    ["run", "plan", "presets", "doctor", "status", "resume", "logs", "store", "serve", "batch"],
 )
 def test_every_command_explains_itself(command, capsys):
     with pytest.raises(SystemExit) as stopped:
