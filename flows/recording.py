@@ -243,13 +243,14 @@ def _log_to(file: Path, stage: Callable[[], str]) -> Iterator[None]:
     for logger in (flows, stages):
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)
-    # What the recorder says is for the file: the console has a display of its own.
-    flows.propagate = False
+        # These lines are for the file: the console has a display of its own, and Prefect, once it
+        # is imported, prints whatever reaches the root.
+        logger.propagate = False
     try:
         yield
     finally:
-        flows.propagate = True
         for logger, level in zip((flows, stages), levels, strict=True):
+            logger.propagate = True
             logger.removeHandler(handler)
             logger.setLevel(level)
         handler.close()
