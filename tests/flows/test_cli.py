@@ -34,7 +34,7 @@ finally:
     assert cpu_s < HELP_LIMIT_S
 
 
-@pytest.mark.parametrize("command", ["run", "plan", "presets", "doctor"])
+@pytest.mark.parametrize("command", ["run", "batch", "plan", "presets", "doctor"])
 def test_every_command_explains_itself(command, capsys):
     with pytest.raises(SystemExit) as stopped:
         cli.main([command, "--help"])
