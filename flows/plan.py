@@ -168,7 +168,7 @@ def make_plan(
     seed: int,
     store: Store,
     selection: Selection,
-    code: Callable[[str], dict[str, str]] = code_digests,
+    code: Callable[[str], dict[str, str]] | None = None,
     explained: bool = True,
 ) -> Plan:
     """Look up every stage in the store and say why those that are missing are.
@@ -180,7 +180,7 @@ def make_plan(
         seed: of the run.
         store: where artifacts are.
         selection: which part is asked for.
-        code: the digests of a module and of what it imports.
+        code: tells the digests of a module and of what it imports; by default they are read.
         explained: whether to look for the nearest artifact of each that is missing, which reads
             hundreds of manifests.
 
@@ -193,7 +193,7 @@ def make_plan(
     selection.check(pipeline)
     idle = {node.name for node in pipeline.nodes if not node.has_work_for(source)}
     selection.check_idle(idle, source)
-    recipes = _recipes(pipeline, config, source, seed, selection.skip | idle, code)
+    recipes = _recipes(pipeline, config, source, seed, selection.skip | idle, code or code_digests)
     explain = _Explainer(store) if explained else _call_missing
     steps = []
     for node in pipeline.nodes:
