@@ -16,7 +16,7 @@ from flows.batch_options import batch_options
 from flows.data_options import data_options
 from flows.model_options import model_options
 from flows.operator_options import logs_options, resume_options, status_options, store_options
-from flows.options import edit_options, job_options, photo_settings, relight_options
+from flows.options import edit_options, job_options, relight_options
 from flows.serve_options import serve_options
 from flows.train_options import train_options
 
@@ -82,22 +82,7 @@ def _dispatch(options: argparse.Namespace) -> int:
 
     if options.command == "presets":
         return commands.show_presets()
-    request = commands.Request(
-        source=options.input,
-        out=options.output,
-        preset=options.preset,
-        overrides=(*photo_settings(options), *options.set),
-        skip=frozenset(options.skip),
-        start=options.start,
-        until=options.until,
-        only=options.only,
-        force=frozenset(options.force),
-        seed=options.seed,
-        device=options.device,
-        store=options.store,
-        timeouts=tuple(options.timeout),
-        share=options.share,
-    )
+    request = commands.Request.of(options)
     return commands.show_plan(request) if options.command == "plan" else commands.run(request)
 
 

@@ -1,8 +1,10 @@
 """What the commands do: plan a run, run it, show the presets."""
 
+import argparse
 import importlib.resources
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from rich.console import Console
 from rich.table import Table
@@ -11,6 +13,7 @@ from flows.config import PRESETS, PipelineConfig, load_config, preset_about
 from flows.console import plan_table
 from flows.job import DONE, Job, compute_under_engine
 from flows.limits import parse_limits
+from flows.options import photo_settings
 from flows.pipeline import IMAGE_TO_ASSET
 from flows.plan import Plan, Selection, make_plan
 from stages.store import Store
@@ -57,6 +60,26 @@ class Request:
         """Where the results go."""
         name = self.source if self.source in SHIPPED else self.path.resolve().stem
         return self.out or OUTPUT_ROOT / name
+
+    @classmethod
+    def of(cls, options: argparse.Namespace) -> Self:
+        """What `svim3d run` or `plan` was given."""
+        return cls(
+            source=options.input,
+            out=options.output,
+            preset=options.preset,
+            overrides=(*photo_settings(options), *options.set),
+            skip=frozenset(options.skip),
+            start=options.start,
+            until=options.until,
+            only=options.only,
+            force=frozenset(options.force),
+            seed=options.seed,
+            device=options.device,
+            store=options.store,
+            timeouts=tuple(options.timeout),
+            share=options.share,
+        )
 
     @property
     def command(self) -> tuple[str, ...]:

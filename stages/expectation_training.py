@@ -27,7 +27,6 @@ from svim3d.optim import NamedAdam, Rate, cosine
 ADAM_EPS = 1e-8
 FINAL_RATE = 0.01
 SCALE_BATCHES = 32  # what the residual's scale is measured on
-GROUP_TERMS = ("rgb", "basecolor", "orm", "normal")
 
 
 def train_expectation(
@@ -76,7 +75,7 @@ def train_expectation(
                 return None
         errors, good = _errors(model, expectation, clips, f"step {step}", config, ctx)
         loss = weighted_loss(errors, good)
-        terms = dict(zip(GROUP_TERMS, errors.detach().mean(0).tolist(), strict=True))
+        terms = dict(zip(GROUPS, errors.detach().mean(0).tolist(), strict=True))
         if ctx.is_finite(step, {"loss": loss}):
             adam.zero_grad()
             loss.backward()

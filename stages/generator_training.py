@@ -23,6 +23,7 @@ from stages.settings.training import GeneratorTrainingConfig
 from stages.training_batches import SeenClip, draw_seen
 from svim3d.diffusion.clips import StoredClip
 from svim3d.diffusion.conditioning import Conditioning, embed_picture
+from svim3d.diffusion.groups import GROUPS
 from svim3d.diffusion.model import MaterialDiffusion
 from svim3d.diffusion.training import (
     Clips,
@@ -37,7 +38,6 @@ from svim3d.optim import NamedAdam, Rate, cosine
 
 ADAM_EPS = 1e-8
 AVERAGE = "average."  # prefix of moving averages in a checkpoint
-GROUP_TERMS = ("rgb", "basecolor", "orm", "normal")
 
 
 @dataclass
@@ -223,7 +223,7 @@ def _step(
         errors = velocity_errors(fit.model.unet, left, draws)
     loss = weighted_loss(errors, clips.has_good_materials)
     terms = {"loss": float(loss.detach())}
-    terms |= dict(zip(GROUP_TERMS, errors.detach().mean(0).tolist(), strict=True))
+    terms |= dict(zip(GROUPS, errors.detach().mean(0).tolist(), strict=True))
     if ctx.is_finite(step, {"loss": loss}):
         fit.adam.zero_grad()
         loss.backward()

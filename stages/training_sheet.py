@@ -8,8 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from stages.training_batches import SeenClip
 from svim3d.diffusion.autoencoder import Autoencoder, decode, encode
-from svim3d.diffusion.conditioning import Conditioning, camera_numbers, embed_picture
+from svim3d.diffusion.conditioning import Conditioning, embed_picture
 from svim3d.diffusion.groups import as_network_input
 from svim3d.diffusion.model import MaterialDiffusion, Sampling
 from svim3d.io.clip_file import read_clip
@@ -28,22 +29,22 @@ def draw_generator_sheet(
     rows: list[Tensor] = []
     labels: list[str] = []
     for clip in map(read_clip, clips):
-        truth = torch.cat([clip.rgb[0][None], clip.materials[int(clip.form[0])]]).float()
-        shown = clip.pictures[0, -1].to(model.device).float() / 127.5 - 1.0
-        camera = camera_numbers(clip.elevation_deg[0], clip.azimuth_deg[0], model.spec.cond_aug).to(
-            model.device
-        )
+        seen = SeenClip(clip, light=0, order=torch.arange(clip.azimuth_deg.shape[1]))
+        shown = seen.picture[None].to(model.device)
         conditioning = Conditioning(
-            token=embed_picture(model.image_encoder, shown[None]).detach(),
-            latent=truth[0, -1][None].to(model.device),
-            camera=camera[None],
-            picture=shown[None],
+            token=embed_picture(model.image_encoder, shown).detach(),
+            latent=seen.reference[None].to(model.device),
+            camera=seen.camera(model.spec)[None].to(model.device),
+            picture=shown,
         )
         drawn = (
             model.draw(conditioning, seed, Sampling(steps=STEPS)).cpu() / model.spec.latent_scale
         )
-        ours = drawn.unflatten(1, (len(model.spec.groups), -1)).transpose(0, 1)
-        frames = torch.linspace(0, len(camera) - 1, COLUMNS).round().long()
+        truth, ours = (
+            latents.unflatten(1, (len(model.spec.groups), -1)).transpose(0, 1)
+            for latents in (seen.latents, drawn)
+        )
+        frames = torch.linspace(0, len(seen.order) - 1, COLUMNS).round().long()
         for group, name in enumerate(model.spec.groups):
             for kind, latents in (("truth", truth), ("ours", ours)):
                 rows += _pictures(model.autoencoder, latents[group, frames])

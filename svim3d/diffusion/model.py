@@ -290,16 +290,15 @@ class MaterialDiffusion:
         Its plain twin: `denoise` without and with the reference view, and `guide` between them.
         """
         network = PreparedUNet(self.unet, compiled=sampling.compiled)
-        alone = self.expecting(conditioning)
-        both = self.expecting(conditioning.beside_unconditional())
-        bound_alone, bound_both = network.bind(alone), network.bind(both)
         weights = self.guidance(conditioning, sampling).to(self.device)
         guides = bool((weights != 1.0).any())
+        branches = [conditioning, *([conditioning.beside_unconditional()] if guides else [])]
+        ready = [(told, network.bind(told)) for told in map(self.expecting, branches)]
 
         def denoise(noisy: Tensor, sigma: float) -> Tensor:
             # Frames of weight 1 need the unconditional branch too: their neighbours see them in it.
             guided = guides and sampling.interval.holds(sigma)
-            told, bound = (both, bound_both) if guided else (alone, bound_alone)
+            told, bound = ready[-1] if guided else ready[0]
             residual = self.residual(noisy, told)
             level = self._level(sigma)
             known = c_noise(level).to(self.device, torch.float32)

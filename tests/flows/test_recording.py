@@ -15,7 +15,6 @@ from flows import recording
 from flows.cli import _parser
 from flows.commands import Request
 from flows.job import compute_here
-from flows.options import photo_settings
 from flows.recording import RunRecorder
 from flows.run_records import CANCELLED, DONE, FAILED, RUNNING, RunIndex
 from stages.base import Progress
@@ -178,21 +177,7 @@ def test_recorded_command_asks_for_the_same(given, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     def request_of(arguments) -> Request:
-        options = _parser().parse_args(["run", *arguments])
-        return Request(
-            source=options.input,
-            out=options.output,
-            preset=options.preset,
-            overrides=(*photo_settings(options), *options.set),
-            skip=frozenset(options.skip),
-            start=options.start,
-            until=options.until,
-            only=options.only,
-            force=frozenset(options.force),
-            seed=options.seed,
-            device=options.device,
-            store=options.store,
-        )
+        return Request.of(_parser().parse_args(["run", *arguments]))
 
     first = request_of(given)
     again = request_of(first.command[1:])
