@@ -14,12 +14,15 @@ from flows.batch_job import BatchJob, JobError, first_line
 from flows.batch_results import DONE, Results, Row, State
 from flows.config import PipelineConfig, load_config
 from flows.engine import Engine
+from flows.hooks import Hooks, announce_death
 from flows.job import interrupt_on_stop
 from flows.limits import parse_limits
 from flows.options import photo_settings
 from flows.pipeline import IMAGE_TO_ASSET
 from flows.plan import Selection
 from flows.run_folder import require_ours
+from flows.run_records import RunIndex
+from flows.workers import WorkerLostError, Workers
 from stages.errors import InputError
 from stages.store import Store
 
@@ -39,6 +42,7 @@ def batch(options: argparse.Namespace) -> int:
     overrides = (*photo_settings(options), *options.set)
     load_config(PipelineConfig, options.preset, overrides, options.skip)
     Selection(skip=frozenset(options.skip)).check(IMAGE_TO_ASSET)
+    Hooks.of_environment()
     limits_s = parse_limits(options.timeout, IMAGE_TO_ASSET.names)
     jobs = [_job(entry, options, overrides, limits_s) for entry in entries]
     interrupt_on_stop()
@@ -128,6 +132,8 @@ class _Run:
 
     def failed(self, job: BatchJob, error: BaseException) -> None:
         """Note a failure and go on."""
+        if isinstance(error, WorkerLostError):
+            announce_death(RunIndex(self.store.root), job.out, first_line(error))
         if not isinstance(error, JobError):
             error = JobError("", first_line(error), 0.0)
         told = (round(error.seconds, 3), error.stage, error.message)
@@ -165,8 +171,6 @@ class _Run:
 
 def _compute(groups: list[list[BatchJob]], run: _Run, options: argparse.Namespace) -> None:
     """Compute the first of each group under the engine, and let the others find it."""
-    from flows.workers import Workers
-
     group_of = {group[0].name: group for group in groups}
     at_once = min(options.jobs, len(groups))
     with Engine(options.store / "prefect") as engine:

@@ -4,8 +4,7 @@ import functools
 import json
 import logging
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,8 +26,6 @@ log = logging.getLogger("stages")  # where stages and store warn
 # 9 ms of CPU instead of 260.
 _code = functools.cache(code_digests)
 _config = functools.cache(load_config)
-
-LOG = "log.txt"  # in a run folder: what stages and store warned of
 
 
 @dataclass(frozen=True)
@@ -146,43 +143,24 @@ def do_job(job: BatchJob) -> float:
     start = time.monotonic()
     watch = _Watch()
     try:
-        with _log_in(job.out):
-            # Prefect and torch, which the one who hands jobs out may do without.
-            from flows.image_to_asset import run_plan
-            from flows.steps import Bench
-            from stages.execution import choose_device
-            from stages.shared_store import open_store
+        # Prefect and torch, which the one who hands jobs out may do without.
+        from flows.image_to_asset import run_plan
+        from flows.steps import Bench
+        from stages.execution import choose_device
+        from stages.shared_store import open_store
 
-            store = open_store(job.store, job.share, say=log.warning)
-            plan = job.plan(store)
-            require_ours(job.out, plan.pipeline)
-            with RunRecorder(
-                store, plan, job.out, preset=job.preset, command=job.command
-            ) as recorder:
-                observer = Audience(watch, recorder)
-                bench = Bench(plan, store, choose_device(job.device), observer, job.limits_s)
-                job.finish(plan, run_plan(bench), store)
+        store = open_store(job.store, job.share, say=log.warning)
+        plan = job.plan(store)
+        require_ours(job.out, plan.pipeline)
+        with RunRecorder(store, plan, job.out, preset=job.preset, command=job.command) as recorder:
+            observer = Audience(watch, recorder)
+            bench = Bench(plan, store, choose_device(job.device), observer, job.limits_s)
+            job.finish(plan, run_plan(bench, recorder.record), store)
     except Exception as error:
         seconds = time.monotonic() - start
         # The cause stays here: it may hold what cannot go to another process.
         raise JobError(watch.stage, first_line(error), seconds) from None
     return time.monotonic() - start
-
-
-@contextmanager
-def _log_in(folder: Path) -> Iterator[None]:
-    """Add warnings to a file of the run folder instead of the terminal, which many share."""
-    folder.mkdir(parents=True, exist_ok=True)
-    handler = logging.FileHandler(folder / LOG)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
-    log.addHandler(handler)
-    log.propagate = False
-    try:
-        yield
-    finally:
-        log.propagate = True
-        log.removeHandler(handler)
-        handler.close()
 
 
 class _Watch:
@@ -198,7 +176,7 @@ class _Watch:
         pass
 
     def failed(self, step: Step, error: BaseException) -> None:
-        log.warning("%s: %s: %s", step.node.name, type(error).__name__, error)
+        pass
 
     def finished(self, step: Step, stored: Stored) -> None:
         self.stage = ""

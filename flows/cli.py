@@ -15,7 +15,15 @@ from pathlib import Path
 from flows.batch_options import batch_options
 from flows.data_options import data_options
 from flows.model_options import model_options
-from flows.operator_options import logs_options, resume_options, status_options, store_options
+from flows.operator_options import (
+    ON_END,
+    ON_FAILURE,
+    hook_options,
+    logs_options,
+    resume_options,
+    status_options,
+    store_options,
+)
 from flows.options import edit_options, job_options, relight_options
 from flows.serve_options import serve_options
 from flows.train_options import train_options
@@ -53,6 +61,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.command is None:
         parser.print_help()
         return BAD_INPUT
+    for name, option in ((ON_FAILURE, "on_failure"), (ON_END, "on_end")):
+        if (hook := getattr(options, option, None)) is not None:
+            os.environ[name] = hook  # for all that this command starts, too
     try:
         return _dispatch(options)
     except KeyboardInterrupt:
@@ -100,22 +111,34 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="where artifacts are kept (%(default)s)",
     )
-    job = job_options()
+    job, hooks = job_options(), hook_options()
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     for name, parents, purpose in (
-        ("run", [job, shared], "make the asset; finished stages are taken from the store"),
-        ("batch", [batch_options(), shared], "make the assets of many inputs"),
-        ("relight", [relight_options(), shared], "show views or an asset under another light"),
+        ("run", [job, hooks, shared], "make the asset; finished stages are taken from the store"),
+        ("batch", [batch_options(), hooks, shared], "make the assets of many inputs"),
+        (
+            "relight",
+            [relight_options(), hooks, shared],
+            "show views or an asset under another light",
+        ),
         ("edit", [edit_options(), shared], "write an asset with other materials"),
         ("train", [train_options(), shared], "train a generator on rendered examples"),
         ("data", [data_options(), shared], "render training data for the generator"),
         ("model", [model_options(shared)], "convert a checkpoint, or tell what a model holds"),
         ("plan", [job, shared], "say which stages a run would compute, and why"),
         ("status", [status_options(), shared], "tell how runs go and went"),
-        ("resume", [resume_options(), shared], "carry out again what did not come to its end"),
+        (
+            "resume",
+            [resume_options(), hooks, shared],
+            "carry out again what did not come to its end",
+        ),
         ("logs", [logs_options(), shared], "print what the stages of a run said"),
         ("store", [store_options(shared)], "look at the artifacts, clean up, move them"),
-        ("serve", [serve_options(), shared], "take pictures over HTTP and make assets of them"),
+        (
+            "serve",
+            [serve_options(), hooks, shared],
+            "take pictures over HTTP and make assets of them",
+        ),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
     ):

@@ -27,12 +27,14 @@ STARTUP_TIMEOUT_S = 120.0  # a new data base takes 20 s on a busy machine
 STOP_TIMEOUT_S = 5.0
 DATABASE = "prefect.db"
 
-SETTINGS = {
-    # No word leaves the machine.
-    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
-    "DO_NOT_TRACK": "1",
+# No word leaves the machine.
+SETTINGS = {"PREFECT_SERVER_ANALYTICS_ENABLED": "false", "DO_NOT_TRACK": "1"}
+# With a server of the user's own everything is shown there, and the console stays ours.
+SHOWN = {"PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL"}
+PRIVATE = {
     # The command line speaks to the user; the engine only of its own defects.
     "PREFECT_LOGGING_LEVEL": "CRITICAL",
+    # Nobody can look into a server that ends with the run: `flows.showing` sends nothing either.
     "PREFECT_LOGGING_TO_API_ENABLED": "false",
     # Blocks are not used; registering them costs 0.3 s of each start.
     "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
@@ -65,6 +67,11 @@ class Engine:
         Raises:
             InputError: if the home cannot be made.
         """
+        os.environ.update(SETTINGS)
+        if self._url is not None:
+            for name, value in SHOWN.items():
+                os.environ.setdefault(name, value)
+            return self  # the user's home may hold the key to the user's server
         # Prefect makes its home, but not the folder above; that failure would show as a time-out.
         try:
             self._home.mkdir(parents=True, exist_ok=True)
@@ -73,13 +80,12 @@ class Engine:
                 f"the store cannot be written: no folder {self._home} ({error.strerror}); "
                 "mend its permissions or choose another --store"
             ) from error
-        os.environ.update(SETTINGS | {"PREFECT_HOME": str(self._home)})
-        if self._url is None:
-            self._is_new = not (self._home / DATABASE).exists()
-            if self._is_new and _seed_file().exists():
-                _copy_whole(_seed_file(), self._home / DATABASE)
-                self._is_new = False
-            self._start_server()
+        os.environ.update(PRIVATE | {"PREFECT_HOME": str(self._home)})
+        self._is_new = not (self._home / DATABASE).exists()
+        if self._is_new and _seed_file().exists():
+            _copy_whole(_seed_file(), self._home / DATABASE)
+            self._is_new = False
+        self._start_server()
         return self
 
     def _start_server(self) -> None:
@@ -109,10 +115,14 @@ class Engine:
         try:
             with urllib.request.urlopen(f"{self._url}/health", timeout=STARTUP_TIMEOUT_S):
                 pass
+        except urllib.error.HTTPError:
+            pass  # it answers: one that wants a key shows its health to nobody without
         except (OSError, urllib.error.URLError) as error:
+            why = (
+                f"see {self._home / 'server.log'}" if self._server else "is PREFECT_API_URL right?"
+            )
             raise TransientError(
-                f"the Prefect server at {self._url} does not answer ({error}); "
-                f"see {self._home / 'server.log'}"
+                f"the Prefect server at {self._url} does not answer ({error}); {why}"
             ) from error
         self.waited_s = time.monotonic() - start
         if self._is_new:

@@ -1,15 +1,20 @@
 """The flow: a plan's steps in order, each a task, every artifact handed on by reference."""
 
+import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
-from prefect import flow, runtime
+from prefect import flow, runtime, tags
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
 from prefect.events.worker import EventsWorker
 from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
 
-from flows.plan import Verdict
+from flows.plan import Plan, Verdict
+from flows.recording import Audience
+from flows.run_records import RunRecord
+from flows.showing import Showcase, is_watched
 from flows.steps import RETRY_DELAYS_S, Bench
 from flows.tasks import run_step
 from stages.store import Stored
@@ -19,12 +24,16 @@ RECORD_POLL_S = 0.05
 
 
 def run_plan(
-    bench: Bench, *, retry_delays_s: Sequence[float] = RETRY_DELAYS_S
+    bench: Bench,
+    record: RunRecord | None = None,
+    *,
+    retry_delays_s: Sequence[float] = RETRY_DELAYS_S,
 ) -> dict[str, Stored]:
     """Run what a plan asks for, under Prefect.
 
     Args:
         bench: the plan, and where to run it.
+        record: the run's page in the store: names the flow run, and is named by what it shows.
         retry_delays_s: pauses before each further try after a passing fault.
 
     Returns:
@@ -34,7 +43,7 @@ def run_plan(
 
     @flow(
         name=plan.pipeline.name,
-        flow_run_name=f"{plan.source.stem}-seed{plan.seed}",
+        flow_run_name=_name(plan, record),
         persist_result=False,
         validate_parameters=False,
     )
@@ -42,10 +51,12 @@ def run_plan(
         artifacts: dict[str, Stored] = {}
         tried = 0
         try:
-            for step in plan.steps:
-                if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):
-                    tried += 1
-                    artifacts[step.node.name] = run_step(step, artifacts, bench, retry_delays_s)
+            with _shown(bench, record) as watched:
+                for step in plan.steps:
+                    if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):
+                        tried += 1
+                        made = run_step(step, artifacts, watched, retry_delays_s)
+                        artifacts[step.node.name] = made
         finally:
             if runtime.flow_run.parent_flow_run_id is None:  # others' server goes on
                 _await_records(tried)
@@ -53,8 +64,31 @@ def run_plan(
 
     keys = {step.node.name: step.recipe.key for step in plan.steps if step.recipe}
     # A heartbeat tells a deployment's zombies; here it only makes the end of a run a second late.
-    with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
+    with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}), tags(*_tags(plan, record)):
         return run_steps(source=str(plan.source), keys=keys)
+
+
+def _name(plan: Plan, record: RunRecord | None) -> str:
+    """What tells a run from others in a list: asset, preset, seed."""
+    preset = record.preset if record else ""
+    return " · ".join(part for part in (plan.source.stem, preset, f"seed {plan.seed}") if part)
+
+
+def _tags(plan: Plan, record: RunRecord | None) -> list[str]:
+    """What runs are searched by."""
+    of_record = {"preset": record.preset, "run": record.id} if record else {}
+    named = {"asset": plan.source.stem, **of_record}
+    return [f"{name}:{value}" for name, value in named.items() if value]
+
+
+@contextlib.contextmanager
+def _shown(bench: Bench, record: RunRecord | None) -> Iterator[Bench]:
+    """The bench with one more who watches, where there is somebody to show things to."""
+    if not is_watched():
+        yield bench
+        return
+    with Showcase(bench.plan, record) as showcase, showcase.logging_shown():
+        yield replace(bench, observer=Audience(bench.observer, showcase))
 
 
 def _await_records(expected: int) -> None:

@@ -14,6 +14,7 @@ from flows.engine import Engine
 from flows.plan import Plan, Verdict
 from flows.recording import Audience, RunRecorder
 from flows.run_folder import require_ours, write_run_folder
+from flows.run_records import RunRecord
 from stages.shared_store import open_store
 from stages.store import Stored
 
@@ -62,6 +63,11 @@ class Job:
         self.console.print(text, style="yellow", highlight=False, markup=False)
         if self._recorder is not None:
             self._recorder.say(text)
+
+    @property
+    def record(self) -> RunRecord | None:
+        """The run's page, while the plan is carried out."""
+        return self._recorder.record if self._recorder else None
 
     def watched_by(self, display: "Observer") -> "Observer":
         """Who is told of the stages: a display, and the run's record."""
@@ -134,7 +140,7 @@ def compute_under_engine(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[
         engine.wait()
         with stage_warnings_on(job.console), RunDisplay(job.console) as display:
             bench = Bench(plan, job.store, device, job.watched_by(display), job.limits_s)
-            artifacts = run_plan(bench)
+            artifacts = run_plan(bench, job.record)
         return artifacts, {"engine_startup_s": round(engine.waited_s, 2)}
 
 

@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 
 RUN_HELP = "id of a run or its beginning, its run folder, or that one's name"
+# Variables that the options about hooks set.
+ON_FAILURE, ON_END = "SVIM3D_ON_FAILURE", "SVIM3D_ON_END"
 UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 
 
@@ -14,6 +16,29 @@ def status_options() -> argparse.ArgumentParser:
         "run", nargs="?", metavar="RUN", help=f"{RUN_HELP} (a table of the newest runs)"
     )
     options.add_argument("--all", action="store_true", help="a table of all runs")
+    options.add_argument(
+        "--failed",
+        action="store_true",
+        help="only those that resume --all-failed would carry out again; the exit code is 1 if "
+        "there are any",
+    )
+    return options
+
+
+def hook_options() -> argparse.ArgumentParser:
+    """Options of the commands that carry out runs: who is told how they end."""
+    options = argparse.ArgumentParser(add_help=False)
+    hooks = options.add_argument_group(
+        "when a run ends",
+        "a COMMAND gets what there is to say as JSON and in variables (SVIM3D_RUN, SVIM3D_STATE, "
+        "SVIM3D_ERROR, ...), a URL (http, https) is posted the JSON",
+    )
+    hooks.add_argument(
+        "--on-failure",
+        metavar="COMMAND|URL",
+        help=f"tell of runs that failed or were cancelled (${ON_FAILURE})",
+    )
+    hooks.add_argument("--on-end", metavar="COMMAND|URL", help=f"tell of all runs (${ON_END})")
     return options
 
 

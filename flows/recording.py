@@ -10,6 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from flows.hooks import Hooks
+from flows.pace import Pace
 from flows.plan import Plan, Step, Verdict
 from flows.processes import Process
 from flows.run_folder import replace_file
@@ -57,6 +59,9 @@ class RunRecorder:
         folder: the run folder; gets copies of page and log.
         preset: of settings; empty where there are none.
         command: arguments that do the same again.
+
+    Raises:
+        InputError: who is to be told of the run's end cannot be.
     """
 
     def __init__(
@@ -67,6 +72,8 @@ class RunRecorder:
         self._plan = plan
         self._writing = threading.Lock()
         self._written_s = 0.0
+        self._pace = Pace()
+        self._hooks = Hooks.of_environment()
         self._logging = contextlib.ExitStack()
         now = time.time()
         self.record = RunRecord(
@@ -136,9 +143,12 @@ class RunRecorder:
             log.error(line, exc_info=error)
         self._change(state=state, error=line, ended=time.time())
         log.info("%s after %.1f s", state, self.record.duration_s)
-        self._logging.close()
-        with contextlib.suppress(OSError):
-            self._copy_to_folder()
+        try:
+            self._hooks.announce(self.record)
+        finally:
+            self._logging.close()
+            with contextlib.suppress(OSError):
+                self._copy_to_folder()
 
     def _copy_to_folder(self) -> None:
         """Let the run folder tell of the run without the store."""
@@ -154,27 +164,37 @@ class RunRecorder:
 
     def started(self, step: Step) -> None:
         """A stage begins to compute."""
-        name = step.node.name
-        self._change(stage=name, step=0, total=0, **self._stage(name, state=COMPUTING))
+        self._at_work(step, state=COMPUTING)
         log.info("computing %s (%s)", step.key8, step.reason)
 
     def progressed(self, progress: "Progress") -> None:
         """A stage has done some of its steps."""
+        left_s = self._pace.left_s(progress)
         if time.monotonic() - self._written_s > WRITE_EVERY_S:
-            self._change(step=progress.step, total=progress.total)
+            due = None if left_s is None else time.time() + left_s
+            self._change(step=progress.step, total=progress.total, due=due)
 
     def failed(self, step: Step, error: BaseException) -> None:
         """A stage failed; it may be tried again."""
-        self._change(**self._stage(step.node.name, state=FAILED))
-        log.warning(_in_a_line(error))
+        line = _in_a_line(error)
+        events = (*self.record.stages[step.node.name].events, line)
+        self._change(**self._stage(step.node.name, state=FAILED, events=events))
+        log.warning(line)
 
     def finished(self, step: Step, stored: Stored) -> None:
         """A stage's artifact is in the store."""
-        name, record = step.node.name, stored.manifest.record
+        record = stored.manifest.record
         state = CACHED if stored.is_cached else COMPUTED
         seconds = None if stored.is_cached else record.get("seconds")
-        self._change(stage=name, step=0, total=0, **self._stage(name, state=state, seconds=seconds))
+        # The artifact tells of the attempts that failed, too.
+        events = tuple(str(event.get("message", "")) for event in record.get("events", ()))
+        self._at_work(step, state=state, seconds=seconds, events=events)
         log.info("%s %s: %s", state, step.key8, record.get("headline", ""))
+
+    def _at_work(self, step: Step, **changes: Any) -> None:
+        """Name a stage that begins or ends, with what has changed about it."""
+        name = step.node.name
+        self._change(stage=name, step=0, total=0, due=None, **self._stage(name, **changes))
 
     def _stage(self, name: str, **changes: Any) -> dict[str, dict[str, StageRecord]]:
         stages = self.record.stages

@@ -13,7 +13,7 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -38,11 +38,18 @@ class StageRecord:
         key: of its artifact; None where it is left out.
         state: "waiting", "computing", "failed", or as in the run's closing table.
         seconds: that computing it took.
+        events: fallbacks taken, attempts that failed, views dropped, as messages.
     """
 
     key: str | None
     state: str
     seconds: float | None = None
+    events: tuple[str, ...] = ()
+
+    @classmethod
+    def parse(cls, entry: Mapping[str, Any]) -> Self:
+        """Read a page's entry."""
+        return cls(**{**entry, "events": tuple(entry.get("events", ()))})
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,7 @@ class RunRecord:
         changed: when the page was last written.
         ended: None while it runs.
         error: how it failed, in a line.
+        due: when the stage at work should be done, by its pace so far; None while unknown.
     """
 
     id: str
@@ -86,6 +94,7 @@ class RunRecord:
     changed: float
     ended: float | None
     error: str
+    due: float | None = None
 
     @property
     def asset(self) -> str:
@@ -125,7 +134,7 @@ class RunRecord:
         """
         try:
             page: dict[str, Any] = json.loads(text)
-            stages = {name: StageRecord(**entry) for name, entry in page.pop("stages").items()}
+            stages = {name: StageRecord.parse(entry) for name, entry in page.pop("stages").items()}
             process = Process(**page.pop("process"))
             command = tuple(page.pop("command"))
             record = cls(command=command, process=process, stages=stages, **page)
@@ -139,7 +148,9 @@ class RunRecord:
         """Whether values are what their names promise; a page may come from elsewhere."""
         texts = (self.id, self.cwd, self.pipeline, self.source, self.preset, self.folder)
         ended = self.changed if self.ended is None else self.ended
-        numbers = (self.step, self.total, self.started, self.changed, ended, self.process.pid)
+        due = self.changed if self.due is None else self.due
+        times = (self.started, self.changed, ended, due)
+        numbers = (self.step, self.total, *times, self.process.pid)
         return (
             all(isinstance(t, str) for t in (*texts, self.state, self.stage, self.error))
             and all(isinstance(argument, str) for argument in self.command)
@@ -147,6 +158,7 @@ class RunRecord:
             and all(isinstance(n, int | float) and 0 <= n < 1e11 for n in numbers)
             and all(isinstance(s.key, str | None) for s in self.stages.values())
             and all(isinstance(s.state, str) for s in self.stages.values())
+            and all(isinstance(event, str) for s in self.stages.values() for event in s.events)
             and ID.fullmatch(self.id) is not None
         )
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -49,14 +50,26 @@ def status(options: argparse.Namespace) -> int:
     """Tell of one run, or print a table of them."""
     index, console = RunIndex(options.store), table_console()
     if options.run is not None:
-        _tell(index.find(options.run), index, console)
-        return EXIT_DONE
+        record = index.find(options.run)
+        _tell(record, index, console)
+        return EXIT_FAILED if options.failed and record.now in UNFINISHED else EXIT_DONE
     records = newest_of_folders(index.records())
-    if not records:
-        console.print(f"no runs in {index.folder}", highlight=False)
-        return EXIT_DONE
     states = {record.id: record.now for record in records}
-    shown = records if options.all else records[:SHOWN_RUNS]
+    if options.failed:
+        records = [record for record in records if states[record.id] in UNFINISHED]
+    if not records:
+        kind = "failed runs" if options.failed else "runs"
+        console.print(f"no {kind} in {index.folder}", highlight=False)
+        return EXIT_DONE
+    _show_table(records, states, options.all, console)
+    return EXIT_FAILED if options.failed else EXIT_DONE
+
+
+def _show_table(
+    records: Sequence[RunRecord], states: Mapping[str, str], is_whole: bool, console: Console
+) -> None:
+    """A line for each run, the newest ones where not all are wanted, and how many are how."""
+    shown = records if is_whole else records[:SHOWN_RUNS]
     table = Table(box=None, pad_edge=False)
     # Where a terminal is too narrow, names that nobody types are cut.
     for column in ("run", "asset", "preset", "state", "stage", "progress"):
@@ -77,10 +90,10 @@ def status(options: argparse.Namespace) -> int:
             in_short(record.duration_s),
         )
     console.print(table)
-    counts = ", ".join(f"{n} {state}" for state, n in Counter(states.values()).most_common())
+    tally = Counter(states[record.id] for record in records)
+    counts = ", ".join(f"{n} {state}" for state, n in tally.most_common())
     hidden = f"; the newest {len(shown)} are shown, --all shows all" if shown != records else ""
     console.print(f"{len(records)} runs: {counts}{hidden}", highlight=False)
-    return EXIT_DONE
 
 
 def _tell(record: RunRecord, index: RunIndex, console: Console) -> None:
@@ -108,10 +121,13 @@ def _tell(record: RunRecord, index: RunIndex, console: Console) -> None:
     console.print(table)
     stages = Table("stage", "state", "key", box=None, pad_edge=False)
     stages.add_column("seconds", justify="right")
+    stages.add_column("events")
     for name, stage in record.stages.items():
         seconds = "" if stage.seconds is None else f"{stage.seconds:.1f}"
         became = "stopped" if stage.state == COMPUTING and state != RUNNING else stage.state
         stages.add_row(escape(name), escape(became), escape((stage.key or "")[:8]), seconds)
+        for event in stage.events:
+            stages.add_row("", "", "", "", f"[yellow]{escape(event)}")
     console.print(stages)
     if state in UNFINISHED and record.command:
         console.print(f"svim3d resume {record.id} goes on where it stopped", highlight=False)
@@ -122,7 +138,10 @@ def progress_of(record: RunRecord) -> str:
     wanted = [stage for stage in record.stages.values() if stage.key]
     there = sum(stage.state in (CACHED, COMPUTED) for stage in wanted)
     share = f" {record.step / record.total:.0%}" if record.total else ""
-    return f"{there}/{len(wanted)}{share}"
+    left = ""
+    if record.due is not None and record.now == RUNNING:
+        left = f", {in_short(record.due - time.time())} left"
+    return f"{there}/{len(wanted)}{share}{left}"
 
 
 def in_short(seconds: float) -> str:

@@ -45,7 +45,7 @@ def run_step(
     """Run one step of a plan as a Prefect task."""
     stage_task = STAGE_TASK.with_options(
         name=step.node.name,
-        task_run_name=f"{step.node.name}-{step.key8}",
+        task_run_name=f"{step.node.name}-{bench.plan.source.stem}-{step.key8}",
         tags=[f"stage:{step.node.name}", f"device:{bench.device.type}"],
         retries=len(retry_delays_s),
         retry_delay_seconds=list(retry_delays_s),

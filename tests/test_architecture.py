@@ -99,7 +99,7 @@ DOORS = {
     "yaml": ("flows",),
     "OpenEXR": ("svim3d.io.exr",),
     "safetensors": ("svim3d.io.weights",),
-    "PIL": ("svim3d.io.image", "svim3d.io.photo", "svim3d.io.photo_header"),
+    "PIL": ("svim3d.io.image", "svim3d.io.photo", "svim3d.io.photo_header", "svim3d.io.thumbnail"),
     "onnxruntime": ("svim3d.io.matting_network",),
     "imageio_ffmpeg": ("svim3d.io.animation",),
     # A script for an interpreter of its own: nothing imports it.
@@ -135,6 +135,7 @@ LIGHT = (
     "flows.data_options",
     "flows.edit",
     "flows.engine",
+    "flows.hooks",
     "flows.job",
     "flows.limits",
     "flows.model",
