@@ -31,7 +31,6 @@ def stage_page(stored: Stored, pictures: Pictures) -> str:
     return "\n\n".join(
         part
         for part in (
-            f"**{_plain(record.get('headline', ''))}**",
             ", ".join(facts),
             _list(_events(record)),
             *(_picture(name, content) for name, content in pictures.items()),

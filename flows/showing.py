@@ -156,7 +156,7 @@ class Showcase:
             client.update_artifact(self._bar, ArtifactUpdate(data=percent, description=about))
             return
         bar = ArtifactCreate(
-            key=self._key("progress"),
+            key="progress",
             type="progress",
             data=percent,
             description=about,
@@ -173,7 +173,7 @@ class Showcase:
             client.update_artifact(self._bar, ArtifactUpdate(data=100.0, description=about))
             self._bar = None
         pictures = thumbnails(stored.folder, most_bytes=PICTURE_BYTES)
-        about = stored.manifest.record.get("headline", "")
+        about = f"{self._plan.source.stem}: {stored.manifest.record.get('headline', '')}"
         self._show(client, step.node.name, stage_page(stored, pictures), about, task_run)
 
     def _show_run(self, client: SyncPrefectClient, error: str) -> None:
@@ -181,14 +181,16 @@ class Showcase:
         shown = next(best, None)
         pictures = {} if shown is None else thumbnails(shown.folder, most_bytes=PICTURE_BYTES)
         page = run_page(self._plan, self._artifacts, pictures, self._record, error)
-        self._show(client, "run", page, error or f"{len(self._artifacts)} stages done", None)
+        told = error or f"{len(self._artifacts)} stages done"
+        self._show(client, "run", page, f"{self._plan.source.stem}: {told}", None)
 
     def _show(
         self, client: SyncPrefectClient, name: str, page: str, about: str, task_run: UUID | None
     ) -> None:
         client.create_artifact(
             ArtifactCreate(
-                key=self._key(name),
+                # The pages of all runs about the same stage are found together.
+                key=name.replace("_", "-"),
                 type="markdown",
                 data=page,
                 description=about,
@@ -196,7 +198,3 @@ class Showcase:
                 task_run_id=task_run,
             )
         )
-
-    def _key(self, name: str) -> str:
-        """Under which the pages of all runs about the same stage are found."""
-        return f"{self._plan.pipeline.name}-{name}".replace("_", "-")

@@ -22,7 +22,13 @@ def write(folder, **contents: str) -> None:
         (folder / f"{name}.txt").write_text(text)
 
 
-def test_batch_isolates_failures_replaces_workers_and_goes_on(engine, tmp_path, capsys):
+def test_batch_isolates_failures_replaces_workers_and_goes_on(
+    engine, tmp_path, capsys, monkeypatch
+):
+    told = tmp_path / "told"
+    monkeypatch.setenv(
+        "SVIM3D_ON_FAILURE", f'echo "$SVIM3D_ASSET $SVIM3D_STATE $SVIM3D_STAGE" >> {told}'
+    )
     write(tmp_path / "in", a="1 2", twin="1 2", broken="one", lost="3", doomed="4")
     lines = [
         {"input": "in/a.txt"},
@@ -55,6 +61,10 @@ def test_batch_isolates_failures_replaces_workers_and_goes_on(engine, tmp_path, 
     assert same[0] == same[1] != same[2]
     # a and twin are one recipe of three stages, other and lost have theirs, doomed got to one.
     assert sum(1 for _ in Store(store).recent(99)) == 3 + 3 + 3 + 1
+    # The batch tells of those that were killed; of what never began there is no run.
+    assert sorted(told.read_text().splitlines()) == ["broken failed digits", "doomed died walk"]
+    log = (out / "broken" / "run.log").read_text()
+    assert "write numbers" in log and not (out / "broken" / "log.txt").exists()
     assert "4 failed" in capsys.readouterr().out.split("results.csv: ")[1]
 
     # What is left is what failed; mended inputs are computed, and others not touched.
@@ -81,7 +91,12 @@ def _require_subflows() -> None:
                 break
             assert time.monotonic() < deadline, [(run.name, run.state_name) for run in runs]
             time.sleep(0.2)
-    assert {run.name for run in below} >= {"a-seed0", "a-seed1", "broken-seed0", "lost-seed0"}
+    assert {run.name for run in below} >= {
+        "a · standard · seed 0",
+        "a · standard · seed 1",
+        "broken · standard · seed 0",
+        "lost · standard · seed 0",
+    }
 
 
 def test_fault_of_the_batch_itself_is_raised(engine, tmp_path):

@@ -83,9 +83,9 @@ def test_computed_and_cached_stages_show_as_such(engine, store, source):
     watcher, second = execute(store, source, "walk.steps=3")
     states = {r.name: r.state_name for r in recorded_tasks()}
     assert states == {
-        f"digits-{second['digits'].key[:8]}": "Cached",
-        f"walk-{second['walk'].key[:8]}": "Completed",
-        f"total-{second['total'].key[:8]}": "Completed",
+        f"digits-digits-{second['digits'].key[:8]}": "Cached",
+        f"walk-digits-{second['walk'].key[:8]}": "Completed",
+        f"total-digits-{second['total'].key[:8]}": "Completed",
     }
     tags = {tag for run in recorded_tasks() for tag in run.tags}
     assert {"stage:digits", "stage:walk", "stage:total", "device:cpu"} <= tags

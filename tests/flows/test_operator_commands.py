@@ -78,6 +78,37 @@ def test_status_of_one_run_shows_its_stages_and_how_to_go_on(svim3d, index):
     assert ["nerf", "stopped", "aaaaaaaa"] in rows and ["dmtet", "skipped"] in rows
 
 
+def test_status_tells_how_long_the_stage_at_work_will_take(svim3d, index):
+    live = page(1, state=RUNNING, ended=None, step=30, total=200, due=time.time() + 90.5)
+    index.write(live)
+    assert "1/1 15%, 90 s left" in svim3d("status")[1]
+    assert "1/1 15%, 90 s left" in svim3d("status", live.id)[1]
+    index.write(replace(live, process=gone_process()))
+    assert "left" not in svim3d("status")[1]
+
+
+def test_status_of_one_run_shows_the_events_of_each_stage(svim3d, index):
+    events = ("attempt that failed, number 1: out of memory [x]", "2 views were dropped")
+    index.write(page(1, stages={"nerf": StageRecord("a" * 64, "computed", 60.0, events)}))
+    told = svim3d("status", page(1).id)[1]
+    assert all(event in told for event in events)
+
+
+def test_scripts_learn_from_the_exit_code_whether_anything_failed(svim3d, index):
+    index.write(page(1))
+    index.write(page(2, state=RUNNING, ended=None))
+    assert svim3d("status", "--failed")[0] == cli.DONE
+    assert svim3d("status", page(1).id, "--failed")[0] == cli.DONE
+    died = page(3, state=RUNNING, ended=None, process=gone_process())
+    index.write(died)
+    code, told = svim3d("status", "--failed")
+    assert code == cli.FAILED and told.splitlines()[-1] == "1 runs: 1 died"
+    assert page(1).id not in told and svim3d("status", died.id, "--failed")[0] == cli.FAILED
+    assert svim3d("status")[0] == cli.DONE
+    index.write(replace(page(4), folder=died.folder))  # run again since, and done
+    assert svim3d("status", "--failed")[0] == cli.DONE
+
+
 def test_unknown_run_is_bad_usage_and_no_runs_are_none(svim3d, store):
     assert svim3d("status") == (cli.DONE, f"no runs in {store.root / 'runs'}\n")
     for command in ("status", "resume", "logs"):

@@ -4,6 +4,7 @@ import errno
 import json
 import logging
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from tiny_job import carry_out
 from tiny_runs import compute, plan_tiny
 
-from flows import recording
+from flows import pace, recording
 from flows.cli import _parser
 from flows.commands import Request
 from flows.job import compute_here
@@ -115,6 +116,45 @@ def test_page_moves_with_the_steps_but_is_not_written_at_each(store, source, tmp
         recorded.progressed(Progress("walk", 4, 40, {}))
         assert (index.records()[0].step, index.records()[0].total) == (4, 40)
         assert states(index.records()[0]) == ["waiting", "computing", "waiting"]
+
+
+def test_page_tells_when_the_stage_will_be_done(store, source, tmp_path, monkeypatch):
+    monkeypatch.setattr(recording, "WRITE_EVERY_S", 0.0)
+    clock = iter((100.0, 102.0, 103.0, 200.0, 201.0))
+    monkeypatch.setattr(pace.time, "monotonic", lambda: next(clock))
+    follow = pace.Pace()
+    # A resumed stage begins in its midst: what it did before this run says nothing of its pace.
+    assert [follow.left_s(Progress("walk", step, 40, {})) for step in (20, 24, 30)] == [
+        None,
+        2.0 / 4 * 16,
+        3.0 / 10 * 10,
+    ]
+    # Tried again, it goes back.
+    assert [follow.left_s(Progress("walk", step, 40, {})) for step in (20, 30)] == [None, 1.0]
+    monkeypatch.undo()
+    monkeypatch.setattr(recording, "WRITE_EVERY_S", 0.0)
+    recorded = recorder(store, source, tmp_path / "out")
+    with recorded:
+        walk = plan_tiny(store, source).steps[1]
+        recorded.started(walk)
+        for step in (1, 2):
+            time.sleep(0.05)
+            recorded.progressed(Progress("walk", step, 41, {}))
+        left_s = RunIndex(store.root).records()[0].due - time.time()
+        assert 0.5 < left_s < 30.0
+        recorded.started(plan_tiny(store, source).steps[2])
+        assert RunIndex(store.root).records()[0].due is None
+
+
+def test_events_of_stages_are_on_the_page(store, source, tmp_path):
+    record = carry_out(
+        store, source, tmp_path / "out", "walk.fault=defect", skip=frozenset({"walk"})
+    )
+    [event] = record.stages["total"].events
+    assert "walk" in event
+    failed = carry_out(store, source, tmp_path / "out", "walk.fault=defect")
+    assert failed.stages["walk"].events == ("RuntimeError: a defect",)
+    assert failed.stages["digits"].events == ()
 
 
 def test_cleaning_takes_nothing_that_a_run_at_work_has_named(store, source, tmp_path):

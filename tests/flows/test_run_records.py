@@ -43,9 +43,21 @@ def test_page_is_read_as_it_was_written(index):
     ]
 
 
+def test_page_of_an_earlier_version_is_read(index):
+    index.write(page(3))
+    old = json.loads(index.page(page(3).id).read_text())
+    del old["due"], old["stages"]["nerf"]["events"]
+    index.page(page(3).id).write_text(json.dumps(old))
+    [record] = index.records()
+    assert record.due is None and record.stages["nerf"].events == ()
+
+
 @pytest.mark.parametrize(
     "change",
     [
+        {"due": "soon"},
+        {"stages": {"a": {"key": None, "state": "done", "events": [1]}}},
+        {"stages": {"a": {"key": None, "state": "done", "events": None}}},
         {"id": "../evil"},
         {"id": ".hidden"},
         {"id": 7},
