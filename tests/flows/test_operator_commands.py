@@ -79,10 +79,10 @@ def test_status_of_one_run_shows_its_stages_and_how_to_go_on(svim3d, index):
 
 
 def test_status_tells_how_long_the_stage_at_work_will_take(svim3d, index):
-    live = page(1, state=RUNNING, ended=None, step=30, total=200, due=time.time() + 90.5)
+    live = page(1, state=RUNNING, ended=None, step=30, total=200, due=time.time() + 8800.0)
     index.write(live)
-    assert "1/1 15%, 90 s left" in svim3d("status")[1]
-    assert "1/1 15%, 90 s left" in svim3d("status", live.id)[1]
+    assert "1/1 15%, 2 h left" in svim3d("status")[1]
+    assert "1/1 15%, 2 h left" in svim3d("status", live.id)[1]
     index.write(replace(live, process=gone_process()))
     assert "left" not in svim3d("status")[1]
 
