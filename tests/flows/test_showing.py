@@ -23,11 +23,10 @@ class Teller(Watcher):
         logging.getLogger("stages.teller").info("begun %s", step.node.name)
 
     def progressed(self, progress):
-        if progress.step == 1 or progress.step == progress.total:
-            say = logging.getLogger("flows.teller").info
-            thread = threading.Thread(target=say, args=("from a thread",))
-            thread.start()
-            thread.join()
+        say = logging.getLogger("flows.teller").info
+        thread = threading.Thread(target=say, args=("from a thread",))
+        thread.start()
+        thread.join()
 
     def finished(self, step, stored):
         pass
@@ -59,7 +58,8 @@ def execute(store: Store, source: Path, *overrides: str, watched: bool = True, s
         deadline = time.monotonic() + 20
         while len(lines := client.read_logs(of_run)) < said and time.monotonic() < deadline:
             time.sleep(0.1)
-    return run, {a.key: a for a in artifacts}, {t.name: t.id for t in tasks}, lines, error
+    named = {a.key: a for a in artifacts if a.key}  # Prefect keeps results without a key
+    return run, named, {t.name: t.id for t in tasks}, lines, error
 
 
 @pytest.fixture

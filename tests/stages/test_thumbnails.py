@@ -60,3 +60,4 @@ def test_light_is_shown_as_it_is_displayed(tmp_path: Path):
     EnvironmentLight(torch.full((16, 16, 3), 0.18)).save(tmp_path)
     [(name, content)] = thumbnails(tmp_path, most_bytes=20_000).items()
     assert name == LIGHT and np.abs(decoded(content) - 0.5).max() < 0.02
+    assert decoded(content).shape == (128, 256, 3)
