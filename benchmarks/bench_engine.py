@@ -42,10 +42,10 @@ with Engine(pathlib.Path(sys.argv[1])) as engine:
 """
 PREFECTS_OWN = f"""
 import os, pathlib, sys
-from flows.engine import SETTINGS
+from flows.engine import PRIVATE, SETTINGS
 home = pathlib.Path(sys.argv[1])
 home.mkdir(parents=True, exist_ok=True)
-os.environ.update(SETTINGS, PREFECT_HOME=str(home))
+os.environ.update(SETTINGS | PRIVATE, PREFECT_HOME=str(home))
 os.environ["PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS"] = "120"
 import torch
 {FLOW}
