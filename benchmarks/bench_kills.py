@@ -284,7 +284,7 @@ def main() -> int:
             kills += go_round(scene, f"round{number}", given.stages, draw)
             kills += go_training(training, scene.folder / f"training{number}", draw)
             kills += go_batch(Batch(scene, f"batch{number}"), draw)
-        print(table(kills))
+            print(table(kills), flush=True)
     return int(any(kill.harm or not kill.is_equal for kill in kills))
 
 

@@ -134,4 +134,4 @@ class Batch:
 
 def moments_of(draw: random.Random, cpu_s: float, count: int) -> list[float]:
     """CPU seconds at which to kill, none of them before the command has read its arguments."""
-    return [draw.uniform(0.2 * cpu_s, 0.9 * cpu_s) for _ in range(count)]
+    return [draw.uniform(0.2 * cpu_s, 0.7 * cpu_s) for _ in range(count)]
