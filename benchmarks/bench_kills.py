@@ -19,6 +19,7 @@ once. `--faults` goes through what else befalls a store instead: see `kill_fault
 """
 
 import argparse
+import contextlib
 import random
 import signal
 import sys
@@ -266,8 +267,10 @@ def main() -> int:
     parser.add_argument("--faults", nargs="*", metavar="NAME", choices=list(FAULTS))
     parser.add_argument("--folder", type=Path, help="where the temporary folder is made")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory(dir=given.folder) as folder:
-        scene = Scene(Path(folder), given.source)
+    with (
+        tempfile.TemporaryDirectory(dir=given.folder) as folder,
+        contextlib.closing(Scene(Path(folder), given.source)) as scene,
+    ):
         scene.measure()
         print(
             f"undisturbed: {scene.total_cpu_s:.1f} CPU s, {scene.start_cpu_s:.1f} of them before "

@@ -187,6 +187,7 @@ class Scene:
         seconds: CPU seconds of each stage of the undisturbed run.
         start_cpu_s: CPU seconds before its first stage.
         content: by key, digests of all files that the undisturbed run published.
+        subjects: all that were started.
     """
 
     folder: Path
@@ -195,6 +196,14 @@ class Scene:
     start_cpu_s: float = 0.0
     total_cpu_s: float = 0.0
     content: dict[str, dict[str, str]] = field(default_factory=dict)
+    subjects: list[Subject] = field(default_factory=list)
+
+    def close(self) -> None:
+        """Leave nothing running, whatever went wrong."""
+        for subject in self.subjects:
+            if not subject.is_over:
+                subject.kill(signal.SIGKILL, whole_group=True)
+                subject.process.wait()
 
     def run_arguments(self, store: Path, out: Path) -> list[str]:
         """Of `svim3d`, for the run that all is about."""
@@ -230,7 +239,8 @@ class Scene:
                 stderr=stream,
                 start_new_session=True,
             )
-        return Subject(process, store, output, mark)
+        self.subjects.append(Subject(process, store, output, mark))
+        return self.subjects[-1]
 
     def measure(self) -> None:
         """Make the undisturbed run."""

@@ -5,12 +5,12 @@ what that said, and what became of the store afterwards. Disks that are full or 
 ones in memory, mounted for the purpose (as root; elsewhere these rows are left out).
 """
 
+import contextlib
 import os
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -100,7 +100,7 @@ class Site:
         return []
 
 
-@contextmanager
+@contextlib.contextmanager
 def small_disk() -> Iterator[Path]:
     """A disk of its own, which can be filled without harm."""
     with tempfile.TemporaryDirectory() as folder:
@@ -113,10 +113,11 @@ def small_disk() -> Iterator[Path]:
 
 
 def fill(disk: Path, *, leave: int = 0) -> Path:
-    """Take what is free, but for so many bytes."""
+    """Take what is free, but for so many bytes; others may write at the same time."""
     ballast = disk / "ballast"
-    with ballast.open("wb") as stream:
-        os.posix_fallocate(stream.fileno(), 0, shutil.disk_usage(disk).free - leave)
+    with ballast.open("wb", buffering=0) as stream, contextlib.suppress(OSError):
+        while shutil.disk_usage(disk).free > leave or not leave:
+            stream.write(b"\0" * 2**18)
     return ballast
 
 
