@@ -31,6 +31,7 @@ def run_plan(
         The artifact of every stage that was asked for and not skipped.
     """
     plan = bench.plan
+    faults: list[Exception] = []
 
     @flow(
         name=plan.pipeline.name,
@@ -46,6 +47,9 @@ def run_plan(
                 if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):
                     tried += 1
                     artifacts[step.node.name] = run_step(step, artifacts, bench, retry_delays_s)
+        except Exception as fault:
+            faults.append(fault)
+            raise
         finally:
             if runtime.flow_run.parent_flow_run_id is None:  # others' server goes on
                 _await_records(tried)
@@ -54,7 +58,13 @@ def run_plan(
     keys = {step.node.name: step.recipe.key for step in plan.steps if step.recipe}
     # A heartbeat tells a deployment's zombies; here it only makes the end of a run a second late.
     with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
-        return run_steps(source=str(plan.source), keys=keys)
+        try:
+            return run_steps(source=str(plan.source), keys=keys)
+        except Exception:
+            # Where the disk is full the engine cannot note a stage's fault, and raises its own.
+            if faults:
+                raise faults[0] from faults[0].__cause__
+            raise
 
 
 def _await_records(expected: int) -> None:

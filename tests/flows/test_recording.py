@@ -164,6 +164,12 @@ def test_store_that_cannot_be_written_costs_the_page_only(store, source, tmp_pat
     assert RunIndex(store.root).records() == []
 
 
+def test_log_on_a_full_disk_costs_its_lines_only(capsys):
+    with recording._log_to(Path("/dev/full"), lambda: "nerf"):
+        logging.getLogger("flows").info("lost")
+    assert capsys.readouterr().err == ""
+
+
 @pytest.mark.parametrize("days", [-7, 7])
 def test_clock_that_jumps_changes_no_result(store, source, tmp_path, monkeypatch, days):
     undisturbed = carry_out(Store(tmp_path / "other"), source, tmp_path / "out")
