@@ -40,6 +40,7 @@ def run_plan(
         The artifact of every stage that was asked for and not skipped.
     """
     plan = bench.plan
+    faults: list[Exception] = []
 
     @flow(
         name=plan.pipeline.name,
@@ -57,6 +58,9 @@ def run_plan(
                         tried += 1
                         made = run_step(step, artifacts, watched, retry_delays_s)
                         artifacts[step.node.name] = made
+        except Exception as fault:
+            faults.append(fault)
+            raise
         finally:
             if runtime.flow_run.parent_flow_run_id is None:  # others' server goes on
                 _await_records(tried)
@@ -65,7 +69,13 @@ def run_plan(
     keys = {step.node.name: step.recipe.key for step in plan.steps if step.recipe}
     # A heartbeat tells a deployment's zombies; here it only makes the end of a run a second late.
     with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}), tags(*_tags(plan, record)):
-        return run_steps(source=str(plan.source), keys=keys)
+        try:
+            return run_steps(source=str(plan.source), keys=keys)
+        except Exception:
+            # Where the disk is full the engine cannot note a stage's fault, and raises its own.
+            if faults:
+                raise faults[0] from faults[0].__cause__
+            raise
 
 
 def _name(plan: Plan, record: RunRecord | None) -> str:

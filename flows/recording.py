@@ -247,10 +247,22 @@ def _in_a_line(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
+class _RunLog(logging.FileHandler):
+    """A log whose lines are lost where they cannot be written: no run fails, or is told, of it."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Say nothing: who writes a full disk's log has other worries."""
+
+    def close(self) -> None:
+        """Close the file, whether or not its last lines could be written."""
+        with contextlib.suppress(OSError):
+            super().close()
+
+
 @contextlib.contextmanager
 def _log_to(file: Path, stage: Callable[[], str]) -> Iterator[None]:
     """Append what flows and stages tell, each line with the stage at work, to a file."""
-    handler = logging.FileHandler(file, encoding="utf-8")
+    handler = _RunLog(file, encoding="utf-8")
     handler.setFormatter(logging.Formatter(LOG_FORMAT, LOG_TIME))
 
     def add_stage(record: logging.LogRecord) -> bool:

@@ -186,8 +186,13 @@ class RunIndex:
         return self.folder / f"{run}.log"
 
     def write(self, record: RunRecord) -> None:
-        """Replace a page in one step."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+        """Replace a page in one step.
+
+        Raises:
+            OSError: it cannot be written; or there is no store, which is not made here: one that
+                went away while it was in use would be in the way of its return.
+        """
+        self.folder.mkdir(exist_ok=True)
         partial = self.folder / f".{record.id}.{os.getpid()}"
         partial.write_bytes(record.as_bytes())
         partial.replace(self.page(record.id))

@@ -1,14 +1,16 @@
 """What a stage is and what it is given to work with."""
 
+import contextlib
 import csv
 import hashlib
 import inspect
 import json
 import logging
 import math
+import re
 import time
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -18,7 +20,7 @@ import torch
 from torch import Tensor
 
 from stages.errors import DivergenceError
-from svim3d.io.weights import load_tensors, save_tensors
+from svim3d.io.weights import load_sealed, save_sealed
 
 log = logging.getLogger(__name__)
 
@@ -26,6 +28,7 @@ CHECKPOINT_EVERY_S = 20.0  # a killed stage loses at most this much work
 MAX_NON_FINITE_STEPS = 20  # beyond this the optimisation is diverging, not hiccuping
 NON_FINITE_STEP = "non_finite_step"  # kind of the event that such a step leaves
 OUT_OF_MEMORY = "out_of_memory"  # kind of the event that an attempt leaves which ran out of it
+SCALAR_ROW = re.compile(rb"(\d{1,9}),[^,\n]+,[^,\n]+\n")  # the step, a term and its value
 MIN_CHUNK = 1024  # smaller ones save little memory, and calls begin to cost more than work
 
 
@@ -54,19 +57,26 @@ class Progress:
 
 
 class Checkpoints:
-    """Named tensors of a half-done stage: the last good step, replaced atomically."""
+    """Named tensors of a half-done stage: the last good step, replaced atomically.
+
+    Args:
+        folder: where they lie; it exists.
+        every_s: how often they are due.
+        before_save: called before each is written.
+        tell: told, by a word and a message, that one was taken up or was damaged.
+    """
 
     def __init__(
         self,
         folder: Path,
         every_s: float = CHECKPOINT_EVERY_S,
         before_save: Callable[[], None] | None = None,
-        after_load: Callable[[], None] | None = None,
+        tell: Callable[[str, str], None] | None = None,
     ) -> None:
         self._file = folder / "checkpoint.safetensors"
         self._every_s = every_s
         self._before_save = before_save
-        self._after_load = after_load
+        self._tell = tell or (lambda kind, message: log.warning(message))
         self._last_s = time.monotonic()
 
     @property
@@ -80,11 +90,10 @@ class Checkpoints:
 
     def save(self, step: int, tensors: Mapping[str, Tensor]) -> None:
         """Replace the checkpoint by the state before `step`."""
-        self._file.parent.mkdir(parents=True, exist_ok=True)
         if self._before_save is not None:
             self._before_save()
         temporary = self._file.with_suffix(".tmp")
-        save_tensors(temporary, {**tensors, "__step__": torch.tensor(step)})
+        save_sealed(temporary, {**tensors, "__step__": torch.tensor(step)})
         temporary.replace(self._file)
         self._last_s = time.monotonic()
 
@@ -97,14 +106,13 @@ class Checkpoints:
         if not self.exists:
             return None
         try:
-            tensors = load_tensors(self._file)
+            tensors = load_sealed(self._file)
             step = int(tensors.pop("__step__"))
         except Exception as error:  # of any kind: a damaged checkpoint costs time, nothing else
-            log.warning("checkpoint %s is unreadable (%s): starting anew", self._file, error)
+            self._tell("damaged_checkpoint", f"started anew, its checkpoint was damaged: {error}")
             self.discard()
             return None
-        if self._after_load is not None:
-            self._after_load()
+        self._tell("resumed", f"went on at step {step} from a checkpoint of an interrupted run")
         return step, tensors
 
 
@@ -138,16 +146,13 @@ class Context:
             self.work,
             self.checkpoint_every_s,
             before_save=self._flush_scalars,
-            after_load=lambda: self.event(
-                "resumed", "went on from a checkpoint of an interrupted run"
-            ),
+            tell=self.event,
         )
         self._scalars: typing.TextIO | None = None
         self._last_progress_s = -math.inf
         self._event_log = self.work / "events.jsonl"
         if self._event_log.exists():
-            lines = self._event_log.read_text().splitlines()
-            self.events.extend(json.loads(line) for line in lines if line.endswith("}"))
+            self.events.extend(_readable_events(self._event_log.read_bytes()))
 
     def __enter__(self) -> Self:
         return self
@@ -184,7 +189,8 @@ class Context:
             log.warning("%s: %s", self.stage, message)
         self.events.append(entry)
         with self._event_log.open("a") as stream:
-            stream.write(json.dumps(entry) + "\n")
+            # Begun anew, in case a full disk has cut the line before.
+            stream.write("\n" + json.dumps(entry) + "\n")
 
     def count(self, kind: str) -> int:
         """How many events of a kind there were, in earlier attempts too."""
@@ -216,9 +222,9 @@ class Context:
     def _open_scalars(self, first_step: int) -> typing.TextIO:
         """Continue what a killed attempt left; its rows from `first_step` on are made again."""
         file = self.work / "scalars.csv"
-        rows = file.read_text().splitlines(keepends=True) if file.exists() else []
-        kept = [r for r in rows if r.endswith("\n") and int(r.partition(",")[0]) < first_step]
-        file.write_text("".join(kept))
+        rows = file.read_bytes().splitlines(keepends=True) if file.exists() else []
+        whole = [match for row in rows if (match := SCALAR_ROW.fullmatch(row))]
+        file.write_bytes(b"".join(row[0] for row in whole if int(row[1]) < first_step))
         return file.open("a", newline="")
 
     def _flush_scalars(self) -> None:
@@ -276,6 +282,14 @@ class Stage:
         """The artifact class that `run` returns."""
         output: type[Any] = self._hints()["return"]
         return output
+
+
+def _readable_events(log_of_events: bytes) -> Iterator[dict[str, str]]:
+    """Entries of an event log; lines that were cut or spoilt are left out."""
+    for line in log_of_events.splitlines():
+        with contextlib.suppress(ValueError, TypeError, KeyError):
+            entry = json.loads(line)
+            yield {"kind": str(entry["kind"]), "message": str(entry["message"])}
 
 
 def _without_none(annotation: Any) -> type[Any]:

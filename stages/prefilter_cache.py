@@ -14,7 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from stages.keys import code_digests, digest_json, library_versions
-from svim3d.io.weights import load_tensors, save_tensors
+from svim3d.io.weights import load_sealed, save_sealed
 from svim3d.shading.prefilter import PyramidOperator
 from svim3d.shading.prefilter_spec import PrefilterMode, PrefilterProfile, PrefilterSpec
 
@@ -66,7 +66,7 @@ def _read(file: Path, spec: PrefilterSpec) -> PyramidOperator | None:
     if not file.exists():
         return None
     try:
-        return PyramidOperator.from_tensors(spec, load_tensors(file))
+        return PyramidOperator.from_tensors(spec, load_sealed(file))
     except Exception as error:  # of any kind: a damaged file costs time, nothing else
         log.warning("prefilter %s is unreadable (%s): computing it anew", file, error)
         return None
@@ -80,7 +80,7 @@ def _publish(file: Path, operator: PyramidOperator) -> None:
         os.close(handle)
         temporary = Path(name)
         try:
-            save_tensors(temporary, operator.to_tensors())
+            save_sealed(temporary, operator.to_tensors())
             temporary.replace(file)
         finally:
             temporary.unlink(missing_ok=True)

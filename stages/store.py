@@ -88,6 +88,7 @@ class Store:
         self.root = root
         self._say = say
         self._verified: set[str] = set()
+        self._was_there = False
 
     def artifact(self, key: str) -> Path:
         """Where the published artifact of `key` lies: payload, scalars and manifest."""
@@ -144,7 +145,8 @@ class Store:
             force: compute though it is there; the new artifact then takes the old one's place.
 
         Raises:
-            TransientError: the disk is full, or another process holds the key for too long.
+            TransientError: the disk is full, the store has gone, or another process holds the key
+                for too long.
             InputError: the store cannot be written.
         """
         key = recipe.key
@@ -166,7 +168,8 @@ class Store:
             artifact: its folder, on the store's file system and known to be sound; it is moved.
 
         Raises:
-            TransientError: the disk is full, or another process holds the key for too long.
+            TransientError: the disk is full, the store has gone, or another process holds the key
+                for too long.
             InputError: the store cannot be written.
         """
         with self._explained(), self._locked(key):
@@ -239,7 +242,10 @@ class Store:
     @contextlib.contextmanager
     def _locked(self, key: str) -> Iterator[None]:
         file = self.root / "lock" / key
+        if self._is_gone():  # a new one in its place would be in the way of its return
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self.root))
         file.parent.mkdir(parents=True, exist_ok=True)
+        self._was_there = True
         with file.open("a+") as stream:
             self._acquire(stream.fileno(), file, key)
             holder = {"pid": os.getpid(), "host": socket.gethostname(), "since": _clock()}
@@ -278,12 +284,21 @@ class Store:
                     f"no space left where the store {self.root} lies; free some space "
                     "or choose another --store, then run again: finished work is kept"
                 ) from error
+            if self._is_gone():
+                raise TransientError(
+                    f"the store {self.root} has gone while it was in use; bring it back, then run "
+                    "again: what was finished in it is kept"
+                ) from error
             if isinstance(error, OSError) and self._is_forbidden(error):
                 raise InputError(
                     f"the store {self.root} cannot be written ({error.strerror}); "
                     "mend its permissions or choose another --store"
                 ) from error
             raise
+
+    def _is_gone(self) -> bool:
+        """Whether the store was deleted, moved or unmounted under this process."""
+        return self._was_there and not (self.root / "lock").is_dir()
 
     def _is_forbidden(self, error: OSError) -> bool:
         is_ours = error.filename is not None and Path(error.filename).is_relative_to(self.root)

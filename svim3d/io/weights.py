@@ -1,6 +1,7 @@
 """The safetensors door: named tensors in one file, no pickle."""
 
 import contextlib
+import hashlib
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,6 +16,7 @@ from torch import Tensor
 Shape = tuple[int, ...]
 
 ZIP, PICKLE = b"PK\x03\x04", b"\x80"  # first bytes of what torch.save writes, now and formerly
+SEAL = "sha256"  # entry of the header's texts: digest over names, types, shapes and content
 LENGTH_BYTES = 8  # a file begins with the length of its header, little endian
 HEADER_ALIGNMENT = 8  # bytes; readers map the numbers behind the header as they are
 TYPE_NAMES = {torch.float16: "F16", torch.bfloat16: "BF16", torch.float32: "F32"}
@@ -65,6 +67,37 @@ def load_metadata(file: Path) -> dict[str, str]:
     """
     with open_tensors(file) as opened:
         return opened.metadata
+
+
+def save_sealed(file: Path, tensors: Mapping[str, Tensor]) -> None:
+    """As `save_tensors`, with a digest by which `load_sealed` tells a file that was damaged.
+
+    For files that no manifest vouches for.
+    """
+    contiguous = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    save_file(contiguous, file, {SEAL: _digest(contiguous)})
+
+
+def load_sealed(file: Path) -> dict[str, Tensor]:
+    """As `load_tensors`; a file that carries no digest is taken as it is.
+
+    Raises:
+        ValueError: see `open_tensors`; or the content is not what was written.
+    """
+    tensors = load_tensors(file)
+    sealed = load_metadata(file).get(SEAL)
+    if sealed is not None and sealed != _digest(tensors):
+        raise ValueError(f"{file} is damaged: its content does not match its digest")
+    return tensors
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    """Sha256 over everything that tells these tensors from others."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name}\n{tensor.dtype}\n{tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 class TensorFile:

@@ -6,6 +6,7 @@ packed anew here: some 0.05 % of its texels overlap where a chart folds, and its
 has another size than was asked for, which would change the gutter.
 """
 
+import math
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ MIN_PROJECTED = 0.25  # cosine below which a face would be drawn too narrow in i
 SPLIT_ROUNDS = 4  # times that faces on top of others stay together before each is cut off alone
 CHART_TEXELS = 1024  # least resolution for xatlas, which stretches charts to whole texels
 BISECTIONS = 24  # of the texture's scale; the last halves it to 1e-7
+GRACE_S = 2  # of xatlas beyond its time, in which its parent, if there still is one, ends it
 FILL_TARGET = 1.2  # scale at which charts of perfect fit would overfill the texture: upper bound
 
 
@@ -105,7 +107,7 @@ def unwrap_charts(
     mesh = vertices.detach().cpu().numpy().astype("<f4"), faces.cpu().numpy().astype("<u4")
     # By file name: the child needs no package path and none of this process's imports.
     content = subprocess.run(
-        [sys.executable, "-P", xatlas_process.__file__],
+        [sys.executable, "-P", xatlas_process.__file__, str(math.ceil(timeout_s) + GRACE_S)],
         input=header.tobytes() + b"".join(array.tobytes() for array in mesh),
         stdout=subprocess.PIPE,
         timeout=timeout_s,

@@ -1,9 +1,11 @@
 """A process of its own for xatlas, so that a call that does not end can be ended.
 
+Its argument is the seconds after which it ends itself: whoever started it may be dead by then.
 Reads a mesh from standard input and writes its atlas to standard output, both as raw little-endian
 numbers (see `svim3d.mesh.atlas`). Imports nothing heavy: it starts in about 0.2 s.
 """
 
+import signal
 import sys
 
 import numpy as np
@@ -12,6 +14,8 @@ import xatlas
 
 def main() -> None:
     """Unwrap one mesh."""
+    # The kernel's alarm also ends a call into compiled code.
+    signal.alarm(int(sys.argv[1]))
     content = sys.stdin.buffer.read()
     vertex_count, face_count, resolution = np.frombuffer(content, "<i4", 3)
     vertices = np.frombuffer(content, "<f4", 3 * vertex_count, 12).reshape(-1, 3)

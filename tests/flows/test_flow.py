@@ -74,6 +74,23 @@ def recorded_tasks() -> list:
         return client.read_task_runs(flow_run_filter=only)
 
 
+def test_fault_of_a_stage_is_told_though_the_engine_cannot_note_it(
+    engine, store, source, monkeypatch
+):
+    from prefect import flow_engine
+
+    propose = flow_engine.propose_state_sync
+
+    def refuse(client, state, **rest):
+        if state.is_failed():
+            raise RuntimeError("500: the data base is full")
+        return propose(client, state, **rest)
+
+    monkeypatch.setattr(flow_engine, "propose_state_sync", refuse)
+    with pytest.raises(InputError, match="the walk cannot start here"):
+        execute(store, source, "walk.fault=input")
+
+
 def test_computed_and_cached_stages_show_as_such(engine, store, source):
     watcher, first = execute(store, source)
     assert [n for what, n in watcher.told if what == "finished"] == ["digits", "walk", "total"]

@@ -24,6 +24,7 @@ PROJECT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def index(store) -> RunIndex:
+    store.root.mkdir()
     return RunIndex(store.root)
 
 

@@ -203,6 +203,26 @@ def test_store_that_cannot_be_written_costs_the_page_only(store, source, tmp_pat
     assert RunIndex(store.root).records() == []
 
 
+def test_log_on_a_full_disk_costs_its_lines_only(capsys):
+    with recording._log_to(Path("/dev/full"), lambda: "nerf"):
+        logging.getLogger("flows").info("lost")
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("days", [-7, 7])
+def test_clock_that_jumps_changes_no_result(store, source, tmp_path, monkeypatch, days):
+    undisturbed = carry_out(Store(tmp_path / "other"), source, tmp_path / "out")
+    now, jump = time.time, iter([0.0] * 4)
+    monkeypatch.setattr(time, "time", lambda: now() + next(jump, 86_400.0 * days))
+    record = carry_out(store, source, tmp_path / "out")
+    assert (record.state, states(record)) == (DONE, ["computed"] * 3)
+    assert next(jump, None) is None and record.duration_s >= 0.0
+    assert record.keys == undisturbed.keys
+    for key in record.keys:
+        made, wanted = (s.check(key).stored.manifest for s in (store, Store(tmp_path / "other")))
+        assert made.files == wanted.files
+
+
 @pytest.mark.parametrize(
     "given",
     [

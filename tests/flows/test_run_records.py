@@ -171,3 +171,10 @@ def test_runs_at_work_are_kept_whatever_their_age():
     assert kept(cats, 1) == {0, 2}
     cats[0] = replace(cats[0], process=gone_process())
     assert kept(cats, 1) == {2}
+
+
+def test_page_makes_no_store(tmp_path):
+    index = RunIndex(tmp_path / "gone")
+    with pytest.raises(FileNotFoundError):
+        index.write(page())
+    assert not (tmp_path / "gone").exists()

@@ -37,6 +37,42 @@ def test_damaged_checkpoint_costs_time_only(tmp_path):
     assert checkpoints.load() is None and not checkpoints.exists
 
 
+def flip_a_bit(content: bytes) -> bytes:
+    return content[:-1] + bytes([content[-1] ^ 1])
+
+
+def cut_in_half(content: bytes) -> bytes:
+    return content[: len(content) // 2]
+
+
+@pytest.mark.parametrize("spoil", [flip_a_bit, cut_in_half])
+def test_damage_to_a_checkpoint_is_an_event_and_so_is_going_on(make_context, spoil):
+    ctx = make_context("nerf")
+    ctx.checkpoints.save(7, {"p": torch.ones(3)})
+    file = ctx.work / "checkpoint.safetensors"
+    file.write_bytes(spoil(file.read_bytes()))
+    ctx = make_context("nerf")
+    assert ctx.checkpoints.load() is None
+    ctx.checkpoints.save(3, {"p": torch.ones(3)})
+    ctx = make_context("nerf")
+    assert ctx.checkpoints.load() is not None
+    damage, resumption = ctx.events
+    assert damage["kind"] == "damaged_checkpoint" and "started anew" in damage["message"]
+    assert resumption["kind"] == "resumed" and "at step 3 " in resumption["message"]
+
+
+def test_records_that_were_cut_or_spoilt_cost_a_line_each(make_context):
+    ctx = make_context("nerf")
+    ctx.event("a", "whole")
+    (ctx.work / "events.jsonl").open("ab").write(b'{"kind": "\xff')
+    (ctx.work / "scalars.csv").write_bytes(b"0,loss,1\n1x,lo\xff,0.1\n1,loss,2\n2,lo")
+    make_context("nerf").event("b", "after the cut")
+    with make_context("nerf") as ctx:
+        ctx.report(2, 3, {"loss": 3.0})
+    assert [entry["message"] for entry in ctx.events] == ["whole", "after the cut"]
+    assert (ctx.work / "scalars.csv").read_text() == "0,loss,1\n1,loss,2\n2,loss,3\n"
+
+
 def test_checkpoint_is_due_after_its_time(tmp_path):
     assert Checkpoints(tmp_path, every_s=0.0).due()
     assert not Checkpoints(tmp_path, every_s=60.0).due()
@@ -74,7 +110,7 @@ def test_events_survive_a_kill_and_are_told_once(make_context):
     ctx.event("dropped_view", "view 4 is empty")
     assert [e["message"] for e in ctx.events] == ["view 3 is empty", "view 4 is empty"]
     lines = (ctx.work / "events.jsonl").read_text().splitlines()
-    assert [json.loads(line) for line in lines] == ctx.events
+    assert [json.loads(line) for line in lines if line] == ctx.events
 
 
 def test_non_finite_steps_are_skipped_then_fatal_by_name(make_context):

@@ -45,10 +45,11 @@ def test_damaged_file_is_computed_anew(tmp_path):
     expected = texels_and_gradient(cached_operator(tmp_path, SIZE))
     file = operator_file(tmp_path, spec)
     whole = file.read_bytes()
-    # Cut short; empty; another spec's content, which is a sound file.
+    # Cut short; empty; a bit flipped among the numbers; another spec's content, a sound file.
     cached_operator(tmp_path, SIZE, "sampled")
     other = operator_file(tmp_path, PrefilterSpec(SIZE, "sampled")).read_bytes()
-    for content in (whole[: len(whole) // 2], b"", other):
+    flipped = whole[:-4] + bytes([whole[-4] ^ 1]) + whole[-3:]
+    for content in (whole[: len(whole) // 2], b"", flipped, other):
         file.write_bytes(content)
         cached_operator.cache_clear()
         found = texels_and_gradient(cached_operator(tmp_path, SIZE))
@@ -77,7 +78,7 @@ def test_interrupted_write_leaves_nothing(tmp_path, monkeypatch):
         file.write_bytes(b"half")
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(prefilter_cache, "save_tensors", fail)
+    monkeypatch.setattr(prefilter_cache, "save_sealed", fail)
     cached_operator(tmp_path, SIZE)
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 

@@ -210,6 +210,26 @@ def test_forbidden_file_of_the_input_is_not_blamed_on_the_store(store, tmp_path)
         store.obtain(recipe(), read_input)
 
 
+def test_store_that_goes_away_is_not_made_anew_and_loses_nothing(store, tmp_path):
+    store.obtain(recipe(radius=1), Stage())
+    away = tmp_path / "away"
+
+    def vanish(payload, work):
+        (work / "checkpoint").write_bytes(b"step 7")
+        store.root.rename(away)
+        (payload / "a.bin").write_bytes(b"pixels")
+        return {}
+
+    for compute in (vanish, Stage()):  # and the next try finds it still gone
+        with pytest.raises(TransientError, match=r"has gone while it was in use; bring it back"):
+            store.obtain(recipe(), compute)
+        assert not store.root.exists()
+    away.rename(store.root)
+    assert (store.work(recipe().key) / "checkpoint").read_bytes() == b"step 7"
+    assert not store.obtain(recipe(), Stage()).is_cached
+    assert store.obtain(recipe(radius=1), Stage()).is_cached
+
+
 # What other processes do: each line runs in a process of its own.
 
 COUNTED = """

@@ -6,7 +6,14 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from svim3d.io.weights import load_tensors, open_tensors, save_one_by_one
+from svim3d.io.weights import (
+    load_sealed,
+    load_tensors,
+    open_tensors,
+    save_one_by_one,
+    save_sealed,
+    save_tensors,
+)
 
 TENSORS = {
     "matrix": torch.arange(6.0).reshape(2, 3),
@@ -107,3 +114,40 @@ def test_missing_files_and_folders_are_refused(tmp_path):
     for path in (tmp_path / "none.safetensors", tmp_path):
         with pytest.raises(ValueError, match="there is no file"):
             load_tensors(path)
+
+
+def test_sealed_tensors_come_back_whatever_they_are(tmp_path):
+    draw = torch.Generator().manual_seed(0)
+    tensors = {
+        "view": torch.randn(4, 3, generator=draw).T,
+        "scalar": torch.tensor(7),
+        "bool": torch.tensor([True, False]),
+        "half": torch.ones(3, dtype=torch.bfloat16),
+        "none": torch.empty(0, 2),
+    }
+    save_sealed(tmp_path / "x", tensors)
+    read = load_sealed(tmp_path / "x")
+    assert all(torch.equal(read[name], value) for name, value in tensors.items())
+    assert set(read) == set(tensors)
+    save_tensors(tmp_path / "old", tensors)  # from before there were seals
+    assert set(load_sealed(tmp_path / "old")) == set(tensors)
+
+
+def test_flipped_bit_anywhere_is_noticed_or_harmless(tmp_path):
+    tensors = {"a": torch.arange(6.0).view(2, 3), "b": torch.tensor(3)}
+    file = tmp_path / "x"
+    save_sealed(file, tensors)
+    whole = file.read_bytes()
+    noticed = 0
+    for place in range(len(whole)):
+        spoilt = bytearray(whole)
+        spoilt[place] ^= 1
+        file.write_bytes(spoilt)
+        try:
+            read = load_sealed(file)
+        except Exception:
+            noticed += 1
+            continue
+        assert set(read) == set(tensors)
+        assert all(torch.equal(read[name], value) for name, value in tensors.items())
+    assert noticed > 0.8 * len(whole)  # the name of the seal, and spaces, may be anything

@@ -1,4 +1,7 @@
 import math
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -132,6 +135,13 @@ def test_boxes_take_over_when_xatlas_hangs_or_fails(bumpy, monkeypatch, tmp_path
     )
     assert reason in atlas.fallback
     assert atlas.texels.overlaps == 0
+
+
+def test_process_whose_parent_was_killed_ends_by_itself():
+    command = [sys.executable, "-P", xatlas_process.__file__, "1"]
+    # Nobody closes its input: without the alarm it would wait for the rest of the mesh for ever.
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        assert process.wait(timeout=60) == -signal.SIGALRM
 
 
 def test_unwrapping_is_deterministic(bumpy):
