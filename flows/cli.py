@@ -32,6 +32,7 @@ DOERS = {
     "data": "flows.data",
     "model": "flows.model",
     "serve": "flows.serve",
+    "automations": "flows.automations",
     "status": "flows.runs",
     "resume": "flows.runs",
     "logs": "flows.runs",
@@ -115,7 +116,8 @@ def _parser() -> argparse.ArgumentParser:
         ("resume", [resume_options(), shared], "carry out again what did not come to its end"),
         ("logs", [logs_options(), shared], "print what the stages of a run said"),
         ("store", [store_options(shared)], "look at the artifacts, clean up, move them"),
-        ("serve", [serve_options(), shared], "take pictures over HTTP and make assets of them"),
+        ("serve", [serve_options(), shared], "do what a Prefect server, or HTTP, asks for"),
+        ("automations", [shared], "let a Prefect server find and resume runs that were killed"),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
     ):

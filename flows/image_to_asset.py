@@ -7,8 +7,8 @@ from prefect import flow, runtime
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
 from prefect.events.worker import EventsWorker
-from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
 
+from flows.heartbeats import heartbeats_if_deployed
 from flows.plan import Verdict
 from flows.steps import RETRY_DELAYS_S, Bench
 from flows.tasks import run_step
@@ -52,8 +52,7 @@ def run_plan(
         return artifacts
 
     keys = {step.node.name: step.recipe.key for step in plan.steps if step.recipe}
-    # A heartbeat tells a deployment's zombies; here it only makes the end of a run a second late.
-    with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
+    with heartbeats_if_deployed():
         return run_steps(source=str(plan.source), keys=keys)
 
 

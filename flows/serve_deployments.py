@@ -1,0 +1,55 @@
+"""`svim3d serve`: runs of the deployments, carried out by this machine without a work pool."""
+
+import argparse
+import asyncio
+import signal
+from pathlib import Path
+
+from prefect.client.orchestration import get_client
+from prefect.exceptions import TerminationSignal
+from prefect.runner import Runner
+from prefect.types.entrypoint import EntrypointType
+from rich.console import Console
+
+from flows.automations import HEARTBEAT_S, TAG, register, require_server, tell
+from flows.deployments import make_asset, make_assets, resume_crashed
+
+NAME = "served"
+RESUMES = 1  # beside the runs: a crashed one is not to wait until the others are done
+STOPPED = 130
+
+
+def serve_deployments(options: argparse.Namespace) -> int:
+    """Register deployments and automations, then do what the server has to be done.
+
+    Raises:
+        InputError: no server is there.
+    """
+    url = require_server()
+    runner = Runner(
+        name=NAME, limit=options.jobs + RESUMES, heartbeat_seconds=HEARTBEAT_S, query_seconds=5
+    )
+    settings = {"store": str(Path(options.store).resolve()), "device": options.device}
+    for deployed, parameters in ((make_asset, settings), (make_assets, settings)):
+        runner.add_deployment(
+            deployed.to_deployment(
+                NAME, tags=[TAG], parameters=parameters, entrypoint_type=EntrypointType.MODULE_PATH
+            )
+        )
+    runner.add_deployment(
+        resume_crashed.to_deployment(NAME, tags=[TAG], entrypoint_type=EntrypointType.MODULE_PATH)
+    )
+    with get_client(sync_client=True) as client:
+        tell(register(client), url)
+    Console().print(
+        f"serving {make_asset.name}/{NAME} and {make_assets.name}/{NAME}, {options.jobs} at a time, "
+        f"from {url}; Ctrl-C ends it",
+        highlight=False,
+    )
+    # A shell starts background jobs with interrupts ignored, and the runner could not be stopped.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        asyncio.run(runner.start())
+    except (KeyboardInterrupt, TerminationSignal):
+        return STOPPED
+    return 0
