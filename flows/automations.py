@@ -1,9 +1,10 @@
 """What keeps deployed runs going when nobody looks: rules that the Prefect server follows.
 
 A killed job is noticed by the worker that started it. Where that died too, a run would be called
-running for ever: the first two rules call it crashed. The others have each crashed run looked at by
-`resume_crashed` in `flows.deployments`, which counts how often it has crashed: Prefect's own action
-for a crash knows no end.
+running for ever: the first two rules call it crashed. The others start the flow `resume` of
+`flows.deployments`, which gives crashed runs further tries and counts them: Prefect's own action
+for a crash knows no end. A loaded server loses events, so that flow looks at all crashed runs,
+whichever event it was started by, and its schedule starts it where the event was lost.
 """
 
 import argparse
@@ -27,6 +28,12 @@ from prefect.client.schemas.filters import (
     DeploymentFilterTags,
     FlowFilter,
     FlowFilterName,
+    FlowRunFilter,
+    FlowRunFilterDeploymentId,
+    FlowRunFilterExpectedStartTime,
+    FlowRunFilterState,
+    FlowRunFilterStateType,
+    FlowRunFilterTags,
 )
 from prefect.client.schemas.objects import FlowRun, State, StateType
 from prefect.settings import PREFECT_API_URL
@@ -37,6 +44,7 @@ from stages.errors import InputError
 
 TAG = "svim3d"  # of deployments and of all that runs inside of them
 RESUME = "resume"  # the flow that looks at crashed runs
+RESUME_CRON = "*/10 * * * *"  # where the event of a crash was lost
 HEARTBEAT_S = 30  # the least that Prefect allows; prefect.yaml and `svim3d serve` set it
 SILENT_S = 120  # four heartbeats; a busy server takes events up to 15 s late
 # A process imports torch and Prefect before its run is running: 5 to 30 s on a loaded machine.
@@ -70,7 +78,7 @@ def judge(run: FlowRun, states: Iterable[State], attempts: int) -> Verdict:
     if run.state is None or not run.state.is_crashed():
         return Verdict(None, "left alone: it is not crashed")
     if run.deployment_id is None:
-        return Verdict(None, "left alone: it belongs to another run, which is resumed for both")
+        return Verdict(None, "left alone: it is part of another run")
     # Not the number of starts: what crashes before it runs would be tried for ever.
     crashes = sum(state.is_crashed() for state in states)
     if crashes > attempts:
@@ -80,6 +88,25 @@ def judge(run: FlowRun, states: Iterable[State], attempts: int) -> Verdict:
     reason = f"crashed; further try {crashes} of {attempts} in {pause_s:g} s"
     when = datetime.now(UTC) + timedelta(seconds=pause_s)
     return Verdict(AwaitingRetry(scheduled_time=when, message=reason), reason)
+
+
+def crashed_runs(client: SyncPrefectClient, hours: float) -> list[FlowRun]:
+    """Runs of our deployments that are crashed; older ones are left to people.
+
+    Args:
+        client: of the server.
+        hours: since they were to start.
+    """
+    return client.read_flow_runs(
+        flow_run_filter=FlowRunFilter(
+            tags=FlowRunFilterTags(all_=[TAG]),
+            deployment_id=FlowRunFilterDeploymentId(is_null_=False),
+            state=FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.CRASHED])),
+            expected_start_time=FlowRunFilterExpectedStartTime(
+                after_=datetime.now(UTC) - timedelta(hours=hours)
+            ),
+        )
+    )
 
 
 def zombie_rules(silent_s: float = SILENT_S) -> list[AutomationCore]:
@@ -120,16 +147,16 @@ def zombie_rules(silent_s: float = SILENT_S) -> list[AutomationCore]:
 
 
 def resume_rule(name: str, resume: UUID, watched: Sequence[UUID]) -> AutomationCore:
-    """The rule that has crashed runs looked at.
+    """The rule that has crashed runs looked at, at once.
 
     Args:
         name: of the deployments.
         resume: the deployment of the flow that looks.
-        watched: deployments whose runs it looks at; never itself, or its crashes had no end.
+        watched: deployments whose crashes start it; never itself, or its crashes had no end.
     """
     return AutomationCore(
         name=f"svim3d: crashed runs of {name}",
-        description="gives them further tries, as many as the deployment of the flow resume says",
+        description="starts the flow that gives crashed runs further tries",
         trigger=EventTrigger(
             expect={"prefect.flow-run.Crashed"},
             match=ResourceSpecification({"prefect.resource.id": ANY}),
@@ -143,13 +170,7 @@ def resume_rule(name: str, resume: UUID, watched: Sequence[UUID]) -> AutomationC
             posture=Posture.Reactive,
             threshold=1,
         ),
-        actions=[
-            RunDeployment(
-                source="selected",
-                deployment_id=resume,
-                parameters={"run": "{{ flow_run.id }}"},
-            )
-        ],
+        actions=[RunDeployment(source="selected", deployment_id=resume)],
     )
 
 

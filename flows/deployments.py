@@ -9,7 +9,6 @@ same store, the same page for `svim3d status`, the same answer from the store wh
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
-from uuid import UUID
 
 from prefect import flow, get_run_logger, runtime, tags
 from prefect.client.orchestration import get_client
@@ -17,7 +16,7 @@ from prefect.client.schemas.objects import State
 from prefect.states import Completed, Failed
 from pydantic import Field
 
-from flows.automations import DEFAULT_ATTEMPTS, RESUME, TAG, judge
+from flows.automations import DEFAULT_ATTEMPTS, RESUME, TAG, crashed_runs, judge
 from flows.batch import ALL_DONE, carry_out
 from flows.batch_job import BatchJob, JobError, do_job
 from flows.batch_options import batch_options
@@ -39,6 +38,7 @@ Setting = Annotated[str, Field(pattern=r"^\s*[a-z][a-z0-9_.]*\s*=")]
 Limit = Annotated[str, Field(pattern=r"^([a-z_]+=)?[0-9.]+$")]
 Share = Annotated[str, Field(pattern=r"^[a-z0-9+]+://")]
 Count = Annotated[int, Field(ge=1, le=256)]
+Hours = Annotated[float, Field(gt=0.0)]
 Inputs = Annotated[list[Input], Field(min_length=1)]
 
 
@@ -170,17 +170,24 @@ def make_assets(
     return Completed(message=str(table)) if code == ALL_DONE else Failed(message=f"see {table}")
 
 
-@flow(name=RESUME, flow_run_name="resume-{run}", persist_result=False)
-def resume_crashed(run: UUID, attempts: Count = DEFAULT_ATTEMPTS) -> State[None]:
-    """Give a crashed run another try, up to so many; the automations call it.
+@flow(name=RESUME, persist_result=False)
+def resume_crashed(attempts: Count = DEFAULT_ATTEMPTS, hours: Hours = 24.0) -> State[None]:
+    """Give runs that crashed further tries, up to so many; the automations call it.
 
     Args:
-        run: Id of the flow run.
         attempts: Further tries that a run gets; after them it is failed.
+        hours: How old a run may be; what was to start earlier is left to people.
     """
+    said = get_run_logger()
+    again = given_up = 0
     with get_client(sync_client=True) as client:
-        verdict = judge(client.read_flow_run(run), client.read_flow_run_states(run), attempts)
-        if verdict.state is not None:
-            client.set_flow_run_state(run, verdict.state, force=True)
-    get_run_logger().info("%s: %s", run, verdict.reason)
-    return Completed(message=verdict.reason)
+        for run in crashed_runs(client, hours):
+            # Read anew: another look may have come to the same run in the meantime.
+            now = client.read_flow_run(run.id)
+            verdict = judge(now, client.read_flow_run_states(run.id), attempts)
+            said.info("%s (%s): %s", run.name, run.id, verdict.reason)
+            if verdict.state is not None:
+                client.set_flow_run_state(run.id, verdict.state, force=True)
+                again += verdict.state.is_scheduled()
+                given_up += verdict.state.is_failed()
+    return Completed(message=f"{again} runs get another try, {given_up} were given up")

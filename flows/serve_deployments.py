@@ -11,11 +11,10 @@ from prefect.runner import Runner
 from prefect.types.entrypoint import EntrypointType
 from rich.console import Console
 
-from flows.automations import HEARTBEAT_S, TAG, register, require_server, tell
+from flows.automations import HEARTBEAT_S, RESUME_CRON, TAG, register, require_server, tell
 from flows.deployments import make_asset, make_assets, resume_crashed
 
 NAME = "served"
-RESUMES = 1  # beside the runs: a crashed one is not to wait until the others are done
 STOPPED = 130
 
 
@@ -26,9 +25,7 @@ def serve_deployments(options: argparse.Namespace) -> int:
         InputError: no server is there.
     """
     url = require_server()
-    runner = Runner(
-        name=NAME, limit=options.jobs + RESUMES, heartbeat_seconds=HEARTBEAT_S, query_seconds=5
-    )
+    runner = Runner(name=NAME, limit=options.jobs, heartbeat_seconds=HEARTBEAT_S)
     settings = {"store": str(Path(options.store).resolve()), "device": options.device}
     for deployed, parameters in ((make_asset, settings), (make_assets, settings)):
         runner.add_deployment(
@@ -37,13 +34,15 @@ def serve_deployments(options: argparse.Namespace) -> int:
             )
         )
     runner.add_deployment(
-        resume_crashed.to_deployment(NAME, tags=[TAG], entrypoint_type=EntrypointType.MODULE_PATH)
+        resume_crashed.to_deployment(
+            NAME, tags=[TAG], cron=RESUME_CRON, entrypoint_type=EntrypointType.MODULE_PATH
+        )
     )
     with get_client(sync_client=True) as client:
         tell(register(client), url)
+    served = f"{make_asset.name}/{NAME} and {make_assets.name}/{NAME}"
     Console().print(
-        f"serving {make_asset.name}/{NAME} and {make_assets.name}/{NAME}, {options.jobs} at a time, "
-        f"from {url}; Ctrl-C ends it",
+        f"serving {served} to {url}, {options.jobs} at a time; Ctrl-C ends it",
         highlight=False,
     )
     # A shell starts background jobs with interrupts ignored, and the runner could not be stopped.
