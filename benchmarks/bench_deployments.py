@@ -55,7 +55,9 @@ def server(home: Path) -> Iterator[str]:
         PREFECT_SERVER_ANALYTICS_ENABLED="false",
         DO_NOT_TRACK="1",
         OMP_NUM_THREADS="1",
-        PYTHONPATH=f"{PROJECT}{os.pathsep}{TINY}",
+        PYTHONPATH=os.pathsep.join(
+            (str(PROJECT), str(TINY), *filter(None, [os.environ.get("PYTHONPATH")]))
+        ),
     )
     command = ["prefect", "server", "start", "--port", str(port), "--no-ui"]
     with started(command, home / "server.log"):

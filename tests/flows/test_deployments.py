@@ -107,6 +107,18 @@ def test_what_does_not_fit_is_refused_before_it_runs(deployments, given):
         deployments.make_asset.validate_parameters(GOOD | given)
 
 
+def test_server_refuses_what_does_not_fit_the_form(deployments):
+    from prefect.client.orchestration import get_client
+    from prefect.exceptions import PrefectHTTPStatusError
+
+    deployment = deployments.make_asset.to_deployment("refuses").apply()
+    with get_client(sync_client=True) as client:
+        for given in ({"source": "shoe.png"}, {"preset": "best"}, {"skip": ["nerf"]}):
+            with pytest.raises(PrefectHTTPStatusError, match="409"):
+                client.create_flow_run_from_deployment(deployment, parameters=GOOD | given)
+        assert client.create_flow_run_from_deployment(deployment, parameters=GOOD).id
+
+
 def test_what_only_the_program_can_tell_fails_in_words(deployments, source, tmp_path):
     given = {"source": str(source), "output": str(tmp_path / "out"), "store": str(tmp_path / "s")}
     for settings, complaint in (
@@ -158,7 +170,7 @@ def test_many_inputs_become_a_table(deployments, tmp_path, monkeypatch):
     out = tmp_path / "out"
     state = deployments.make_assets(**given, output=str(out), return_state=True)
     assert state.is_failed() and state.message == f"see {out / 'results.csv'}"
-    (tmp_path / "in" / "broken.txt").write_text("1")
+    (tmp_path / "in" / "broken.txt").unlink()
     state = deployments.make_assets(**given, output=str(out), return_state=True)
     assert state.is_completed() and state.message == str(out / "results.csv")
 
@@ -233,7 +245,7 @@ def test_one_look_at_crashed_runs_comes_to_all_of_them(deployments, make_tiny, a
     with get_client(sync_client=True) as client:
 
         def run(deployment, *states):
-            made = client.create_flow_run_from_deployment(deployment)
+            made = client.create_flow_run_from_deployment(deployment, parameters=GOOD)
             for state in states:
                 client.set_flow_run_state(made.id, state, force=True)
             return made.id
@@ -245,7 +257,7 @@ def test_one_look_at_crashed_runs_comes_to_all_of_them(deployments, make_tiny, a
             run(ours, *(Crashed() for _ in range(3))),
             run(ours, Running(), Completed()),
             run(others, Running(), Crashed()),
-            client.create_flow_run_from_deployment(ours, state=old).id,
+            client.create_flow_run_from_deployment(ours, parameters=GOOD, state=old).id,
         ]
         client.set_flow_run_state(runs[-1], Crashed(), force=True)
         state = deployments.resume_crashed(attempts=2, return_state=True)
