@@ -123,7 +123,7 @@ class Pool:
             deployed.to_deployment(
                 NAME,
                 tags=[TAG],
-                cron=None if deployed is make_tiny else "* * * * *",  # in place of 10 minutes
+                cron=None if deployed is make_tiny else "* * * * *",  # in place of five minutes
                 work_pool_name=POOL,
                 job_variables={"working_dir": str(self.folder), "env": env},
                 entrypoint_type=EntrypointType.MODULE_PATH,
