@@ -1,6 +1,7 @@
 """`svim3d batch`: many inputs, each a run of its own; what is there already is not done again."""
 
 import argparse
+import contextlib
 import importlib.util
 import os
 import time
@@ -32,6 +33,20 @@ ALL_DONE, SOME_FAILED = 0, 1
 
 def batch(options: argparse.Namespace) -> int:
     """Carry out what the command line names; see `svim3d batch --help`."""
+    interrupt_on_stop()
+    return carry_out(options, Engine(options.store / "prefect"))
+
+
+def carry_out(options: argparse.Namespace, engine: Engine | None = None) -> int:
+    """Make what options of `svim3d batch` name; gives the exit code.
+
+    Args:
+        options: as `batch_options` reads them, and the store.
+        engine: that has to be started; None inside a flow, which has one.
+
+    Raises:
+        InputError: what is wrong for all inputs.
+    """
     if options.jobs < 1:
         raise InputError(f"--jobs {options.jobs}: wanted at least one")
     if options.address and options.runner == LOCAL:
@@ -45,12 +60,11 @@ def batch(options: argparse.Namespace) -> int:
     Hooks.of_environment()
     limits_s = parse_limits(options.timeout, IMAGE_TO_ASSET.names)
     jobs = [_job(entry, options, overrides, limits_s) for entry in entries]
-    interrupt_on_stop()
     run = _Run(Store(options.store), options.output, entries)
     try:
         groups = run.look_up(jobs)
         if groups:
-            _compute(groups, run, options)
+            _compute(groups, run, options, engine)
     except BaseException:
         run.results.cancel()
         raise
@@ -169,17 +183,20 @@ class _Run:
         )
 
 
-def _compute(groups: list[list[BatchJob]], run: _Run, options: argparse.Namespace) -> None:
+def _compute(
+    groups: list[list[BatchJob]], run: _Run, options: argparse.Namespace, engine: Engine | None
+) -> None:
     """Compute the first of each group under the engine, and let the others find it."""
     group_of = {group[0].name: group for group in groups}
     at_once = min(options.jobs, len(groups))
-    with Engine(options.store / "prefect") as engine:
+    with engine or contextlib.nullcontext():
         from flows.batch_flow import Batch, make_runner, run_batch
 
         runner = make_runner(options.runner, at_once, options.address)
         threads = max(1, (os.cpu_count() or 1) // at_once) if at_once > 1 else None
         with Workers(at_once, threads) as workers:
-            engine.wait()
+            if engine is not None:
+                engine.wait()
             run_batch(
                 Batch(
                     [group[0] for group in groups],

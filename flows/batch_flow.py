@@ -12,11 +12,11 @@ from prefect.client.schemas.objects import State
 from prefect.context import hydrated_context, serialize_context
 from prefect.exceptions import FailedRun
 from prefect.futures import as_completed
-from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
 from prefect.states import Completed, Failed
 from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
 from flows.batch_job import BatchJob, do_job
+from flows.heartbeats import heartbeats_if_deployed
 from flows.workers import Workers
 
 Told = Callable[[BatchJob, float | BaseException], None]
@@ -76,7 +76,7 @@ def run_batch(batch: Batch, runner: TaskRunner[Any], name: str) -> None:
     """
     token = _batch.set(batch)
     try:
-        with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
+        with heartbeats_if_deployed():
             batch_flow = _run_inputs.with_options(task_runner=runner, flow_run_name=name)
             state = batch_flow(inputs=len(batch.jobs), return_state=True)
             error = None if state.is_completed() else state.result(raise_on_failure=False)

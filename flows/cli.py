@@ -40,6 +40,7 @@ DOERS = {
     "data": "flows.data",
     "model": "flows.model",
     "serve": "flows.serve",
+    "automations": "flows.automations",
     "status": "flows.runs",
     "resume": "flows.runs",
     "logs": "flows.runs",
@@ -137,8 +138,9 @@ def _parser() -> argparse.ArgumentParser:
         (
             "serve",
             [serve_options(), hooks, shared],
-            "take pictures over HTTP and make assets of them",
+            "do what a Prefect server, or HTTP, asks for",
         ),
+        ("automations", [shared], "let a Prefect server find and resume runs that were killed"),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
     ):

@@ -9,8 +9,8 @@ from prefect import flow, runtime, tags
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
 from prefect.events.worker import EventsWorker
-from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
 
+from flows.heartbeats import heartbeats_if_deployed
 from flows.plan import Plan, Verdict
 from flows.recording import Audience
 from flows.run_records import RunRecord
@@ -67,8 +67,7 @@ def run_plan(
         return artifacts
 
     keys = {step.node.name: step.recipe.key for step in plan.steps if step.recipe}
-    # A heartbeat tells a deployment's zombies; here it only makes the end of a run a second late.
-    with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}), tags(*_tags(plan, record)):
+    with heartbeats_if_deployed(), tags(*_tags(plan, record)):
         try:
             return run_steps(source=str(plan.source), keys=keys)
         except Exception:

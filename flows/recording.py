@@ -135,8 +135,8 @@ class RunRecorder:
 
     def _end(self, error: BaseException | None) -> None:
         state, line = DONE, ""
-        if isinstance(error, KeyboardInterrupt):
-            state = CANCELLED
+        if error is not None and not isinstance(error, Exception):
+            state = CANCELLED  # by the keyboard, the system, or whoever runs a deployment
             log.warning("cancelled")
         elif error is not None:
             state, line = FAILED, _in_a_line(error)

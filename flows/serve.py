@@ -9,11 +9,15 @@ NEEDED = ("fastapi", "uvicorn", "python_multipart")
 
 
 def serve(options: argparse.Namespace) -> int:
-    """Start the service.
+    """Start the service, or serve the deployments.
 
     Raises:
-        InputError: what it is made of is not installed.
+        InputError: what it is made of is not installed, or no Prefect server is there.
     """
+    if not options.http:
+        from flows.serve_deployments import serve_deployments
+
+        return serve_deployments(options)
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(

@@ -6,21 +6,22 @@ import argparse
 def serve_options() -> argparse.ArgumentParser:
     """Options of `serve`; defaults are those of `flows.service.limits`."""
     options = argparse.ArgumentParser(add_help=False)
-    what = options.add_mutually_exclusive_group(required=True)
-    what.add_argument(
-        "--http", action="store_true", help="take pictures over HTTP; needs svim3d[http]"
-    )
     options.add_argument(
-        "--host", default="127.0.0.1", help="address to listen on; only this machine (%(default)s)"
+        "--http",
+        action="store_true",
+        help="take pictures over HTTP instead, without a Prefect server; needs svim3d[http]",
     )
-    options.add_argument("--port", type=_port, default=8000, help="(%(default)s)")
     options.add_argument(
         "--jobs", type=_count, default=1, metavar="N", help="runs at a time (%(default)s)"
     )
     options.add_argument(
         "--device", choices=("auto", "cpu", "cuda"), default="auto", help="(%(default)s)"
     )
-    limits = options.add_argument_group("limits")
+    limits = options.add_argument_group("with --http")
+    limits.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on; only this machine (%(default)s)"
+    )
+    limits.add_argument("--port", type=_port, default=8000, help="(%(default)s)")
     for name, kind, default, metavar, purpose in (
         ("--queue", _count, 32, "N", "jobs that may wait; more are told to come back"),
         ("--max-upload-mib", _positive, 64.0, "MIB", "size of a request"),

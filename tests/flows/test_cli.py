@@ -36,7 +36,21 @@ finally:
 
 @pytest.mark.parametrize(
     "command",
-    ["run", "plan", "presets", "doctor", "status", "resume", "logs", "store", "serve", "batch"],
+    [
+        *(
+            "run",
+            "plan",
+            "presets",
+            "doctor",
+            "status",
+            "resume",
+            "logs",
+            "store",
+            "serve",
+            "batch",
+        ),
+        "automations",
+    ],
 )
 def test_every_command_explains_itself(command, capsys):
     with pytest.raises(SystemExit) as stopped:

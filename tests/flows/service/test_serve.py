@@ -22,7 +22,7 @@ def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys)
 
 @pytest.mark.parametrize(
     "given",
-    [[], ["--http", "--jobs", "0"], ["--http", "--port", "65536"], ["--http", "--keep-h", "nan"]],
+    [["--jobs", "0"], ["--http", "--port", "65536"], ["--http", "--keep-h", "nan"]],
 )
 def test_options_are_checked(given, capsys):
     with pytest.raises(SystemExit) as stopped:
