@@ -230,8 +230,9 @@ def kill_worker(pool: Pool, run: Run) -> list[str]:
     pool.worker.kill()
     pool.worker.wait()
     done_s = run.until("Completed", "Crashed")
+    seen = f"the job is {run.flow_run.state.name} {done_s:.0f} s"
     pool.start_worker()
-    return [f"orphan goes on, done {done_s:.0f} s"]
+    return [seen]
 
 
 def kill_both(pool: Pool, run: Run) -> list[str]:
