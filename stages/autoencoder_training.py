@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from stages.base import Context
 from stages.errors import InputError
+from stages.precision import products_in
 from stages.settings.training import AutoencoderTrainingConfig
 from svim3d.diffusion.autoencoder import encode
 from svim3d.diffusion.groups import as_network_input
@@ -98,7 +99,6 @@ def _losses(
     pictures: Float[Tensor, "b 3 H W"],
     config: AutoencoderTrainingConfig,
 ) -> dict[str, Tensor]:
-    use_bfloat16 = config.precision == "bfloat16"
-    with torch.autocast(pictures.device.type, torch.bfloat16, enabled=use_bfloat16):
+    with products_in(config.precision, pictures.device):
         answer = autoencoder.decode(autoencoder.encode(pictures)).float()
     return picture_loss(answer, pictures, edge_weight=config.edge_weight)

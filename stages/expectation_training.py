@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from stages.base import Context
 from stages.errors import InputError
+from stages.precision import products_in
 from stages.settings.training import ExpectationTrainingConfig
 from stages.training_batches import SeenClip, draw_seen
 from svim3d.diffusion.clips import StoredClip
@@ -106,8 +107,7 @@ def _errors(
     reference = _stacked(seen, "reference", ctx) * keep
     picture = _stacked(seen, "picture", ctx) * keep
     camera = torch.stack([one.camera(model.spec) for one in seen]).to(ctx.device)
-    use_bfloat16 = config.precision == "bfloat16"
-    with torch.autocast(ctx.device.type, torch.bfloat16, enabled=use_bfloat16):
+    with products_in(config.precision, ctx.device):
         answer = expectation(reference, picture, camera)
     squares = (answer.float() - latents) ** 2
     good = torch.tensor([one.clip.has_good_materials for one in seen], device=ctx.device)

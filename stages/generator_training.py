@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from stages.base import Context
 from stages.errors import InputError
+from stages.precision import products_in
 from stages.settings.training import GeneratorTrainingConfig
 from stages.training_batches import SeenClip, draw_seen
 from svim3d.diffusion.clips import StoredClip
@@ -202,7 +203,7 @@ def _token(
     """The embedding of the reference view: as stored, unless the image encoder learns."""
     if seen.clip.tokens is not None:
         return seen.clip.tokens[seen.light, seen.order[-1]].float().to(ctx.device)[None, None]
-    with _autocast(config, ctx):
+    with products_in(config.precision, ctx.device):
         return embed_picture(model.image_encoder, seen.picture[None].to(ctx.device)).float()
 
 
@@ -219,7 +220,7 @@ def _step(
     ).to(ctx.device)
     told = fit.model.expecting(clips.conditioning.dropped(draws.drop))
     left = replace(clips, latents=fit.model.residual(clips.latents, told), conditioning=told)
-    with _autocast(config, ctx):
+    with products_in(config.precision, ctx.device):
         errors = velocity_errors(fit.model.unet, left, draws)
     loss = weighted_loss(errors, clips.has_good_materials)
     terms = {"loss": float(loss.detach())}
@@ -242,7 +243,3 @@ def _rate(step: int, phase: int, config: GeneratorTrainingConfig) -> float:
     into = step - config.phase_1_steps
     share = cosine(into, config.phase_2_steps, config.warm_up, config.final_rate)
     return share * config.rate_2 / config.rate_1
-
-
-def _autocast(config: GeneratorTrainingConfig, ctx: Context) -> torch.autocast:
-    return torch.autocast(ctx.device.type, torch.bfloat16, enabled=config.precision == "bfloat16")

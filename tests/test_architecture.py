@@ -37,6 +37,7 @@ CONTRACT = (
     "stages.prefilter_cache",
     "stages.subject",
     "stages.training_batches",
+    "stages.precision",
     "stages.settings",
 )
 MAY_IMPORT = {
@@ -57,6 +58,7 @@ MAY_IMPORT = {
     "stages.manifest": ("stages.keys",),
     "stages.store": ("stages.keys", "stages.manifest", "stages.errors"),
     "stages.locks": (),
+    "stages.precision": ("stages.settings",),
     "stages.store_cleaning": ("stages.store", "stages.locks", "stages.errors"),
     "stages.store_archive": (
         "stages.store",
@@ -150,6 +152,7 @@ LIGHT = (
     "flows.run_folder",
     "flows.run_records",
     "flows.runs",
+    "flows.stopping",
     "flows.store",
     "flows.serve",
     "flows.serve_options",

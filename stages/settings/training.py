@@ -7,7 +7,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from stages.settings.base import StageConfig
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
-Precision = Literal["float32", "bfloat16"]
+Precision = Literal["auto", "float32", "bfloat16"]
 
 
 class AutoencoderTrainingConfig(StageConfig):
@@ -23,8 +23,8 @@ class AutoencoderTrainingConfig(StageConfig):
     """Weight of differences between neighbouring pixels."""
     objects: PositiveInt = 400
     """Examples kept in memory at once; later ones are passed over."""
-    precision: Precision = "bfloat16"
-    """Of matrix products; parameters stay float32."""
+    precision: Precision = "auto"
+    """Of matrix products: `auto` takes bfloat16 where the device multiplies it."""
 
 
 class LatentsConfig(StageConfig):
@@ -51,8 +51,8 @@ class ExpectationTrainingConfig(StageConfig):
     """Largest norm of a step's gradient."""
     drop_share: Share = 0.1
     """Share of clips that do not see the reference view."""
-    precision: Precision = "bfloat16"
-    """Of matrix products; parameters stay float32."""
+    precision: Precision = "auto"
+    """Of matrix products: `auto` takes bfloat16 where the device multiplies it."""
 
 
 class GeneratorTrainingConfig(StageConfig):
@@ -82,8 +82,8 @@ class GeneratorTrainingConfig(StageConfig):
     """Standard deviation of ln sigma."""
     drop_share: Share = 0.1
     """Share of clips that do not see the reference view."""
-    precision: Precision = "bfloat16"
-    """Of matrix products; parameters stay float32."""
+    precision: Precision = "auto"
+    """Of matrix products: `auto` takes bfloat16 where the device multiplies it."""
     gradient_checkpointing: bool = False
     """Recompute activations on the way back: a third more time, far less memory."""
     checkpoint_every_s: PositiveFloat = 120.0
