@@ -16,13 +16,13 @@ from flows.batch_results import DONE, Results, Row, State
 from flows.config import PipelineConfig, load_config
 from flows.engine import Engine
 from flows.hooks import Hooks, announce_death
-from flows.job import interrupt_on_stop
 from flows.limits import parse_limits
 from flows.options import photo_settings
 from flows.pipeline import IMAGE_TO_ASSET
 from flows.plan import Selection
 from flows.run_folder import require_ours
 from flows.run_records import RunIndex
+from flows.stopping import interrupt_on_stop
 from flows.workers import WorkerLostError, Workers
 from stages.errors import InputError
 from stages.store import Store

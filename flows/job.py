@@ -1,10 +1,8 @@
 """A plan carried out for a person: computed, laid out in a run folder, told about on a console."""
 
-import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -15,6 +13,7 @@ from flows.plan import Plan, Verdict
 from flows.recording import Audience, RunRecorder
 from flows.run_folder import require_ours, write_run_folder
 from flows.run_records import RunRecord
+from flows.stopping import interrupt_on_stop
 from stages.shared_store import open_store
 from stages.store import Stored
 
@@ -157,12 +156,3 @@ def compute_here(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[str, Any
             if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):
                 artifacts[step.node.name] = obtain_step_patiently(step, artifacts, bench)
     return artifacts, {}
-
-
-def interrupt_on_stop() -> None:
-    """Let a stop by the system leave the same resumable state as Ctrl-C."""
-    signal.signal(signal.SIGTERM, _interrupt)
-
-
-def _interrupt(signal_number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt

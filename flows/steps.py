@@ -9,6 +9,7 @@ import torch
 
 from flows.pipeline import SOURCE
 from flows.plan import Plan, Step, Verdict
+from flows.stopping import is_stop_wanted
 from stages.base import Progress
 from stages.execution import run_stage
 from stages.faults import kind_of
@@ -99,5 +100,7 @@ def _compute(step: Step, upstream: Mapping[str, Stored], bench: Bench) -> Stored
             on_progress=bench.observer.progressed,
         )
     except Exception as error:
+        if is_stop_wanted():
+            raise KeyboardInterrupt from error
         bench.observer.failed(step, error)
         raise

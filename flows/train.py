@@ -14,7 +14,8 @@ import yaml
 from rich.console import Console
 
 from flows.config import validated
-from flows.job import DONE, interrupt_on_stop
+from flows.job import DONE
+from flows.stopping import interrupt_on_stop
 from stages.errors import InputError
 from stages.settings.training import TrainingConfig
 

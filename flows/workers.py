@@ -21,7 +21,7 @@ from typing import Any, Self
 
 import cloudpickle
 
-from flows.job import interrupt_on_stop
+from flows.stopping import interrupt_on_stop
 
 LOST = 1  # further tries of a job whose worker died
 STOP_S = 30.0  # longer than a stage needs to notice and write nothing more

@@ -170,6 +170,7 @@ def test_options_set_what_is_handed_on(tmp_path, monkeypatch):
 
 
 def test_death_is_told_by_who_sees_it(store, told):
+    store.root.mkdir()
     index = RunIndex(store.root)
     told("on_failure")
     index.write(page(1))

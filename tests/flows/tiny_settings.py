@@ -10,5 +10,15 @@ class WalkConfig(StageConfig):
 
     steps: int = 40
     pause_s: float = 0.0
-    fault: Literal["", "transient", "memory", "cuda memory", "io", "input", "defect", "killed"] = ""
+    fault: Literal[
+        "",
+        "transient",
+        "memory",
+        "cuda memory",
+        "io",
+        "input",
+        "defect",
+        "killed",
+        "lost interrupt",
+    ] = ""
     faults: int = 1

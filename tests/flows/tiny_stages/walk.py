@@ -48,7 +48,18 @@ def _fail(config: WalkConfig, attempts: Path) -> None:
         if attempts.stat().st_size <= config.faults:
             if config.fault == "killed":
                 os.kill(os.getpid(), signal.SIGKILL)
+            if config.fault == "lost interrupt":
+                _lose_interrupt()
             raise FAULTS[config.fault]
+
+
+def _lose_interrupt() -> None:
+    """As numba's compiler does."""
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(10.0)
+    except KeyboardInterrupt:
+        raise RuntimeError("no compiled object yet") from None
 
 
 WALK = Stage(run)
