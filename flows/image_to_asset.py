@@ -4,11 +4,14 @@ import contextlib
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any, cast
 
 from prefect import flow, runtime, tags
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
+from prefect.client.schemas.objects import State
 from prefect.events.worker import EventsWorker
+from prefect.states import Failed
 
 from flows.heartbeats import heartbeats_if_deployed
 from flows.plan import Plan, Verdict
@@ -48,7 +51,7 @@ def run_plan(
         persist_result=False,
         validate_parameters=False,
     )
-    def run_steps(source: str, keys: dict[str, str]) -> dict[str, Stored]:
+    def run_steps(source: str, keys: dict[str, str]) -> dict[str, Stored] | State[Any]:
         artifacts: dict[str, Stored] = {}
         tried = 0
         try:
@@ -59,8 +62,10 @@ def run_plan(
                         made = run_step(step, artifacts, watched, retry_delays_s)
                         artifacts[step.node.name] = made
         except Exception as fault:
+            # Raised, it would be written to Prefect's home, for nobody; and where the store has
+            # gone, that would be in the way of its return.
             faults.append(fault)
-            raise
+            return Failed(message=f"{type(fault).__name__}: {fault}")
         finally:
             if runtime.flow_run.parent_flow_run_id is None:  # others' server goes on
                 _await_records(tried)
@@ -69,12 +74,14 @@ def run_plan(
     keys = {step.node.name: step.recipe.key for step in plan.steps if step.recipe}
     with heartbeats_if_deployed(), tags(*_tags(plan, record)):
         try:
-            return run_steps(source=str(plan.source), keys=keys)
+            state = run_steps(source=str(plan.source), keys=keys, return_state=True)
         except Exception:
             # Where the disk is full the engine cannot note a stage's fault, and raises its own.
-            if faults:
-                raise faults[0] from faults[0].__cause__
-            raise
+            if not faults:
+                raise
+        if faults:
+            raise faults[0] from faults[0].__cause__
+        return cast(dict[str, Stored], state.result())
 
 
 def _name(plan: Plan, record: RunRecord | None) -> str:

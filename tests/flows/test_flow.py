@@ -91,6 +91,15 @@ def test_fault_of_a_stage_is_told_though_the_engine_cannot_note_it(
         execute(store, source, "walk.fault=input")
 
 
+def test_failed_run_writes_nothing_of_it_to_the_engines_home(engine, store, source):
+    from prefect.settings import PREFECT_LOCAL_STORAGE_PATH
+
+    kept = set(PREFECT_LOCAL_STORAGE_PATH.value().rglob("*"))
+    with pytest.raises(InputError, match="the walk cannot start here"):
+        execute(store, source, "walk.fault=input")
+    assert set(PREFECT_LOCAL_STORAGE_PATH.value().rglob("*")) == kept
+
+
 def test_computed_and_cached_stages_show_as_such(engine, store, source):
     watcher, first = execute(store, source)
     assert [n for what, n in watcher.told if what == "finished"] == ["digits", "walk", "total"]
