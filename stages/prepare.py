@@ -95,7 +95,7 @@ def _one_object(
             f"{100 * share:.2g} %; crop the photo closer to it, or check its transparency"
         )
     if dropped:
-        ctx.event("specks_dropped", f"{dropped} specks beside the object were left out")
+        ctx.event("specks_dropped", f"specks beside the object that were left out: {dropped}")
     alike = sum(size >= LIKE_SIZE * sizes[0] for size in sizes)
     if alike > 1:
         ctx.event(

@@ -134,7 +134,7 @@ def fit_backdrop(lab: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
     if scatter > MAX_SCATTER:
         raise ValueError(
             "wanted a plain background, but the picture's border is no even colour or gradient: "
-            f"it scatters by {scatter:.2f}, more than {MAX_SCATTER}, in Oklab; {ADVICE}"
+            f"it scatters by {scatter:.3f}, more than {MAX_SCATTER:.3f}, in Oklab; {ADVICE}"
         )
     tolerance = float(np.clip(NOISE_TOLERANCE * scatter, MIN_TOLERANCE, MAX_TOLERANCE))
     return _surface(coefficients, BORDER_DEGREE, height, width), tolerance
@@ -287,7 +287,7 @@ def _holes(
     if holes.any():
         notify(
             "seen_through",
-            f"{int(holes.sum())} patches inside the object have just the background's colour: "
+            f"patches inside the object that have just the background's colour: {int(holes.sum())}, "
             "taken for holes; give a picture with the object cut out if they are none",
         )
     return holes[label]
