@@ -130,14 +130,14 @@ def test_what_only_the_program_can_tell_fails_in_words(deployments, source, tmp_
 
 
 def test_deployed_run_is_a_run_like_any_other(make_tiny, source, tmp_path):
-    store, out = tmp_path / "store", tmp_path / "out"
+    store, out = tmp_path / "store", tmp_path / "deployed"
     given = {"source": str(source), "output": str(out), "store": str(store)}
     assert make_tiny(**given, return_state=True).is_completed()
-    record = RunIndex(store).find("out")
+    record = RunIndex(store).find("deployed")
     assert record.state == DONE and record.command[:2] == ("run", str(source))
     assert (out / "total.safetensors").is_file()
     assert make_tiny(**given, return_state=True).is_completed()
-    states = {stage.state for stage in RunIndex(store).find("out").stages.values()}
+    states = {stage.state for stage in RunIndex(store).find("deployed").stages.values()}
     assert states == {"cached"}
 
 
@@ -164,12 +164,12 @@ def test_many_inputs_become_a_table(deployments, tmp_path, monkeypatch):
         monkeypatch.setattr(module, "PipelineConfig", TinyConfig)
     monkeypatch.setattr(batch, "IMAGE_TO_ASSET", TINY_FILES)
     (tmp_path / "a.txt").write_text("1 2")
-    given = {"store": str(tmp_path / "store"), "output": str(tmp_path / "out")}
+    given = {"store": str(tmp_path / "store"), "output": str(tmp_path / "many")}
     there, missing = str(tmp_path / "a.txt"), str(tmp_path / "b.txt")
-    table = tmp_path / "out" / "results.csv"
+    table = tmp_path / "many" / "results.csv"
     state = deployments.make_assets(inputs=[there, missing], **given, return_state=True)
     assert state.is_failed() and state.message == f"see {table}"
-    assert (tmp_path / "out" / "a" / "total.safetensors").is_file()
+    assert (tmp_path / "many" / "a" / "total.safetensors").is_file()
     state = deployments.make_assets(inputs=[there], **given, return_state=True)
     assert state.is_completed() and state.message == str(table)
 
