@@ -6,7 +6,7 @@
 A run is the tiny pipeline of the tests: three stages of a few milliseconds, each row in a store of
 its own. `local`, `dask` and `ray` are `svim3d batch --jobs 2`; the worker at work is killed when
 half the assets are there. `pool` is a Prefect server, a process work pool and one worker with two
-jobs at a time: a job is killed at a quarter, the worker and its jobs at half, then another worker
+jobs at a time that asks for work every two seconds: a job is killed at a quarter, the worker and its jobs at half, then another worker
 is started and the automations find what was lost. `bare` is a loop over the stages with the store.
 
     wall, CPU    seconds from the start of the command, or of the server, to its end; all processes
@@ -175,6 +175,8 @@ def run_pool(scene: Scene) -> int:
         server(scene.folder / "home"),
         contextlib.ExitStack() as workers,
     ):
+        # Of ten seconds between two questions, five would be lost on each of these runs.
+        os.environ["PREFECT_WORKER_QUERY_SECONDS"] = "2"
         pool = Pool(scene.folder, RESUME_CRON, workers)
         pool.start_worker()
         for job in scene.jobs:
