@@ -6,8 +6,9 @@
 A run is the tiny pipeline of the tests: three stages of a few milliseconds, each row in a store of
 its own. `local`, `dask` and `ray` are `svim3d batch --jobs 2`; the worker at work is killed when
 half the assets are there. `pool` is a Prefect server, a process work pool and one worker with two
-jobs at a time that asks for work every two seconds: a job is killed at a quarter, the worker and its jobs at half, then another worker
-is started and the automations find what was lost. `bare` is a loop over the stages with the store.
+jobs at a time that asks for work every two seconds: a job is killed at a quarter, the worker and
+its jobs at half; then another worker is started, and the automations find what was lost. `bare` is
+a loop over the stages with the store.
 
     wall, CPU    seconds from the start of the command, or of the server, to its end; all processes
     first        seconds until the first asset
