@@ -20,7 +20,7 @@ from pool_case import Pool, Run, server
 
 # A walk of 40 steps, long enough to be killed in the middle.
 WALK = ("walk.pause_s=0.25",)
-RESUME_CRON = "* * * * *"  # in place of ten minutes
+RESUME_CRON = "* * * * *"  # in place of five minutes
 
 
 def kill_nothing(pool: Pool, run: Run) -> list[str]:
@@ -41,8 +41,9 @@ def kill_worker(pool: Pool, run: Run) -> list[str]:
     pool.worker.kill()
     pool.worker.wait()
     done_s = run.until("Completed", "Crashed")
+    seen = f"the job is {run.flow_run.state.name} {done_s:.0f} s"
     pool.start_worker()
-    return [f"orphan goes on, done {done_s:.0f} s"]
+    return [seen]
 
 
 def kill_both(pool: Pool, run: Run) -> list[str]:

@@ -54,7 +54,6 @@ SETTINGS = ("walk.steps=10",)
 AT_ONCE = 2
 PRODUCT = "total.safetensors"
 LONGEST_S = 3600.0  # of a row
-RESUME_CRON = "*/10 * * * *"  # as in prefect.yaml
 BARE_SPANS = "spans.json"
 ADOPT_ORPHANS = 36  # PR_SET_CHILD_SUBREAPER of prctl(2)
 COLUMNS = (
@@ -176,6 +175,8 @@ def run_pool(scene: Scene) -> int:
         server(scene.folder / "home"),
         contextlib.ExitStack() as workers,
     ):
+        from flows.automations import RESUME_CRON
+
         # Of ten seconds between two questions, five would be lost on each of these runs.
         os.environ["PREFECT_WORKER_QUERY_SECONDS"] = "2"
         pool = Pool(scene.folder, RESUME_CRON, workers)

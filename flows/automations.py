@@ -44,7 +44,7 @@ from stages.errors import InputError
 
 TAG = "svim3d"  # of deployments and of all that runs inside of them
 RESUME = "resume"  # the flow that looks at crashed runs
-RESUME_CRON = "*/10 * * * *"  # where the event of a crash was lost
+RESUME_CRON = "*/5 * * * *"  # where the event of a crash was lost
 HEARTBEAT_S = 30  # the least that Prefect allows; prefect.yaml and `svim3d serve` set it
 SILENT_S = 120  # four heartbeats; a busy server takes events up to 15 s late
 # A process imports torch and Prefect before its run is running: 5 to 30 s on a loaded machine.

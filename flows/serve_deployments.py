@@ -6,6 +6,7 @@ import signal
 from pathlib import Path
 
 from prefect.client.orchestration import get_client
+from prefect.deployments.runner import RunnerDeployment
 from prefect.exceptions import TerminationSignal
 from prefect.runner import Runner
 from prefect.types.entrypoint import EntrypointType
@@ -27,22 +28,26 @@ def serve_deployments(options: argparse.Namespace) -> int:
     url = require_server()
     runner = Runner(name=NAME, limit=options.jobs, heartbeat_seconds=HEARTBEAT_S)
     settings = {"store": str(Path(options.store).resolve()), "device": options.device}
-    for deployed, parameters in ((make_asset, settings), (make_assets, settings)):
+    for served, parameters, cron in (
+        (make_asset, settings, None),
+        (make_assets, settings, None),
+        (resume_crashed, {}, RESUME_CRON),
+    ):
         runner.add_deployment(
-            deployed.to_deployment(
-                NAME, tags=[TAG], parameters=parameters, entrypoint_type=EntrypointType.MODULE_PATH
+            RunnerDeployment.from_flow(
+                served,
+                NAME,
+                tags=[TAG],
+                parameters=parameters,
+                cron=cron,
+                entrypoint_type=EntrypointType.MODULE_PATH,
             )
         )
-    runner.add_deployment(
-        resume_crashed.to_deployment(
-            NAME, tags=[TAG], cron=RESUME_CRON, entrypoint_type=EntrypointType.MODULE_PATH
-        )
-    )
     with get_client(sync_client=True) as client:
         tell(register(client), url)
-    served = f"{make_asset.name}/{NAME} and {make_assets.name}/{NAME}"
+    names = f"{make_asset.name}/{NAME} and {make_assets.name}/{NAME}"
     Console().print(
-        f"serving {served} to {url}, {options.jobs} at a time; Ctrl-C ends it",
+        f"serving {names} to {url}, {options.jobs} at a time; Ctrl-C ends it",
         highlight=False,
     )
     # A shell starts background jobs with interrupts ignored, and the runner could not be stopped.

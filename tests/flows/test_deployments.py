@@ -163,16 +163,15 @@ def test_many_inputs_become_a_table(deployments, tmp_path, monkeypatch):
     for module in (batch, batch_inputs):
         monkeypatch.setattr(module, "PipelineConfig", TinyConfig)
     monkeypatch.setattr(batch, "IMAGE_TO_ASSET", TINY_FILES)
-    (tmp_path / "in").mkdir()
-    for name, text in (("a", "1 2"), ("broken", "one")):
-        (tmp_path / "in" / f"{name}.txt").write_text(text)
-    given = {"inputs": [str(tmp_path / "in")], "store": str(tmp_path / "store")}
-    out = tmp_path / "out"
-    state = deployments.make_assets(**given, output=str(out), return_state=True)
-    assert state.is_failed() and state.message == f"see {out / 'results.csv'}"
-    (tmp_path / "in" / "broken.txt").unlink()
-    state = deployments.make_assets(**given, output=str(out), return_state=True)
-    assert state.is_completed() and state.message == str(out / "results.csv")
+    (tmp_path / "a.txt").write_text("1 2")
+    given = {"store": str(tmp_path / "store"), "output": str(tmp_path / "out")}
+    there, missing = str(tmp_path / "a.txt"), str(tmp_path / "b.txt")
+    table = tmp_path / "out" / "results.csv"
+    state = deployments.make_assets(inputs=[there, missing], **given, return_state=True)
+    assert state.is_failed() and state.message == f"see {table}"
+    assert (tmp_path / "out" / "a" / "total.safetensors").is_file()
+    state = deployments.make_assets(inputs=[there], **given, return_state=True)
+    assert state.is_completed() and state.message == str(table)
 
 
 def test_prefect_yaml_deploys_what_there_is(deployments, automations):
