@@ -1,4 +1,4 @@
-"""A stage of a plan as a Prefect task: run name, tags, retries by kind of fault, cached state.
+"""A stage of a plan as a Prefect task: run name, retries by kind of fault, cached state.
 
 Tasks are thin. They return a reference to the store, Prefect keeps no result, and there is one
 cache only: the store.
@@ -46,7 +46,6 @@ def run_step(
     stage_task = STAGE_TASK.with_options(
         name=step.node.name,
         task_run_name=f"{step.node.name}-{bench.plan.source.stem}-{step.key8}",
-        tags=[f"stage:{step.node.name}", f"device:{bench.device.type}"],
         retries=len(retry_delays_s),
         retry_delay_seconds=list(retry_delays_s),
     )

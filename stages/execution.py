@@ -1,6 +1,7 @@
 """Run one stage against the store: load its inputs, measure it, save what it returns."""
 
 import contextlib
+import functools
 import os
 import platform
 import resource
@@ -142,6 +143,7 @@ def _surroundings(device: torch.device) -> dict[str, Any]:
     }
 
 
+@functools.cache  # the code that was loaded; a process for each stage would be most of a short one
 def _git_commit() -> str | None:
     """Commit of the checkout that runs, None where the code is no checkout."""
     if not (PROJECT / ".git").exists():

@@ -142,6 +142,7 @@ def _is_named(name: str, text: bytes) -> bool:
     return any(spelling.encode() in text for spelling in spellings)
 
 
+@functools.cache  # reading the metadata of twenty libraries is most of what a plan takes
 def library_versions() -> dict[str, str]:
     """Versions of the numeric libraries, without the build suffix (`2.13.0+cpu` is `2.13.0`)."""
     names = (*NUMERIC_LIBRARIES, *filter(_is_installed, OPTIONAL_LIBRARIES))

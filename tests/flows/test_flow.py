@@ -113,8 +113,8 @@ def test_computed_and_cached_stages_show_as_such(engine, store, source):
         f"walk-digits-{second['walk'].key[:8]}": "Completed",
         f"total-digits-{second['total'].key[:8]}": "Completed",
     }
-    tags = {tag for run in recorded_tasks() for tag in run.tags}
-    assert {"stage:digits", "stage:walk", "stage:total", "device:cpu"} <= tags
+    # For each task with a tag Prefect asks the server for a slot.
+    assert not any(run.tags for run in recorded_tasks())
     assert second["digits"].is_cached and not second["walk"].is_cached
     assert first["digits"].key == second["digits"].key
 
