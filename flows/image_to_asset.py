@@ -56,8 +56,8 @@ def run_plan(
         artifacts: dict[str, Stored] = {}
         tried = 0
         try:
-            # The flow's tags are not for its tasks: of each that has one Prefect asks its server for
-            # a slot, which takes longer than all the rest of a task.
+            # The flow's tags are not for its tasks: for each that has one Prefect asks its server
+            # for a slot, which takes longer than all the rest of a task.
             with _shown(bench, record) as watched, TagsContext(current_tags=set()):
                 for step in plan.steps:
                     if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):

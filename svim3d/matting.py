@@ -287,7 +287,7 @@ def _holes(
     if holes.any():
         notify(
             "seen_through",
-            f"patches inside the object that have just the background's colour: {int(holes.sum())}, "
+            f"patches inside the object of just the background's colour: {int(holes.sum())}, "
             "taken for holes; give a picture with the object cut out if they are none",
         )
     return holes[label]
