@@ -7,13 +7,13 @@ from pathlib import Path
 
 import uvicorn
 
-from flows.job import interrupt_on_stop
 from flows.service.api import make_app
 from flows.service.child import run_command
 from flows.service.limits import MIB, Limits
 from flows.service.outcome import RUN
 from flows.service.queue import STOP_GRACE_S, JobQueue
 from flows.service.records import Record
+from flows.stopping import interrupt_on_stop
 
 FOLDER = "service"  # in the store, so that its disk is the only one to watch
 DONE = 0
