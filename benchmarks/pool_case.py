@@ -42,6 +42,8 @@ def server(home: Path) -> Iterator[str]:
         PREFECT_API_URL=url,
         PREFECT_SERVER_ANALYTICS_ENABLED="false",
         DO_NOT_TRACK="1",
+        # Calling each run late that waits makes writers meet: SQLite then refuses all others too.
+        PREFECT_SERVER_SERVICES_LATE_RUNS_ENABLED="false",
         OMP_NUM_THREADS="1",
         PYTHONPATH=os.pathsep.join(
             (str(PROJECT), str(TINY), *filter(None, [os.environ.get("PYTHONPATH")]))
