@@ -38,12 +38,15 @@ PRIVATE = {
     "PREFECT_LOGGING_TO_API_ENABLED": "false",
     # Blocks are not used; registering them costs 0.3 s of each start.
     "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
+    # A server that is overrun answers in the end; giving up after 5 tries lost 2 of 200 runs.
+    "PREFECT_CLIENT_MAX_RETRIES": "30",
 }
 # Marks that make Prefect run only the services which a private server needs.
 SERVER_MARKS = {
     "PREFECT__SERVER_EPHEMERAL": "1",
     "PREFECT__SERVER_FINAL": "1",
     "PREFECT_UI_ENABLED": "0",
+    "PREFECT_SERVER_DATABASE_TIMEOUT": "120",
     # Nobody looks at its events. Where many write, SQLite refuses some, and their runs fail.
     "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_ENABLED": "false",
     "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",

@@ -1,6 +1,7 @@
 """The flow: a plan's steps in order, each a task, every artifact handed on by reference."""
 
 import contextlib
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -19,9 +20,11 @@ from flows.plan import Plan, Verdict
 from flows.recording import Audience
 from flows.run_records import RunRecord
 from flows.showing import Showcase, is_watched
-from flows.steps import RETRY_DELAYS_S, Bench
+from flows.steps import RETRY_DELAYS_S, Bench, obtain_steps
 from flows.tasks import run_step
 from stages.store import Stored
+
+log = logging.getLogger(__name__)
 
 RECORD_TIMEOUT_S = 3.0  # the server writes what tasks did a moment after they did it
 RECORD_POLL_S = 0.05
@@ -78,10 +81,10 @@ def run_plan(
     with heartbeats_if_deployed(), tags(*_tags(plan, record)):
         try:
             state = run_steps(source=str(plan.source), keys=keys, return_state=True)
-        except Exception:
-            # Where the disk is full the engine cannot note a stage's fault, and raises its own.
+        except Exception as error:  # of the engine, which does not raise what stages fail of
+            log.warning("the engine failed (%s); going on without it", error)
             if not faults:
-                raise
+                return obtain_steps(bench, retry_delays_s)
         if faults:
             raise faults[0] from faults[0].__cause__
         return cast(dict[str, Stored], state.result())

@@ -145,14 +145,9 @@ def compute_under_engine(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[
 
 def compute_here(plan: Plan, job: Job) -> tuple[dict[str, Stored], dict[str, Any]]:
     """Run the plan's steps one after the other in this process, without an engine."""
-    from flows.steps import Bench, obtain_step_patiently
+    from flows.steps import Bench, obtain_steps
     from stages.execution import choose_device
 
-    artifacts: dict[str, Stored] = {}
     with stage_warnings_on(job.console), RunDisplay(job.console) as display:
         device, observer = choose_device(job.device), job.watched_by(display)
-        bench = Bench(plan, job.store, device, observer, job.limits_s)
-        for step in plan.steps:
-            if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):
-                artifacts[step.node.name] = obtain_step_patiently(step, artifacts, bench)
-    return artifacts, {}
+        return obtain_steps(Bench(plan, job.store, device, observer, job.limits_s)), {}

@@ -80,6 +80,18 @@ def obtain_step_patiently(
     return obtain_step(step, upstream, bench)
 
 
+def obtain_steps(
+    bench: Bench, retry_delays_s: Sequence[float] = RETRY_DELAYS_S
+) -> dict[str, Stored]:
+    """The artifacts of a plan's steps, one after the other, without an engine."""
+    artifacts: dict[str, Stored] = {}
+    for step in bench.plan.steps:
+        if step.verdict in (Verdict.CACHED, Verdict.COMPUTE):
+            name = step.node.name
+            artifacts[name] = obtain_step_patiently(step, artifacts, bench, retry_delays_s)
+    return artifacts
+
+
 def _compute(step: Step, upstream: Mapping[str, Stored], bench: Bench) -> Stored:
     if step.recipe is None:
         raise ValueError(f"{step.node.name} is skipped and has nothing to run")

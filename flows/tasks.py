@@ -1,9 +1,10 @@
 """A stage of a plan as a Prefect task: run name, retries by kind of fault, cached state.
 
 Tasks are thin. They return a reference to the store, Prefect keeps no result, and there is one
-cache only: the store.
+cache only: the store. Prefect's records are a view: where they cannot be written, work goes on.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
@@ -13,9 +14,11 @@ from prefect.client.schemas.objects import State, TaskRun
 from prefect.states import Completed
 
 from flows.plan import Step
-from flows.steps import Bench, obtain_step
+from flows.steps import Bench, obtain_step, obtain_step_patiently
 from stages.faults import kind_of
 from stages.store import Stored
+
+log = logging.getLogger(__name__)
 
 
 def _should_retry(_: Task[..., Any], __: TaskRun, state: State[Any]) -> bool:
@@ -49,6 +52,10 @@ def run_step(
         retries=len(retry_delays_s),
         retry_delay_seconds=list(retry_delays_s),
     )
-    # A task that returns a state is handed that state; its result is what the next step needs.
-    state = stage_task(step, upstream, bench, return_state=True)
+    try:
+        # A task that returns a state is handed that state, and so is one that failed.
+        state = stage_task(step, upstream, bench, return_state=True)
+    except Exception as error:  # of the engine, then: its server may be overrun, its disk full
+        log.warning("%s: the engine failed (%s); going on without it", step.node.name, error)
+        return obtain_step_patiently(step, upstream, bench, retry_delays_s)
     return cast(Stored, state.result())

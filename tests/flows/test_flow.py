@@ -91,6 +91,32 @@ def test_fault_of_a_stage_is_told_though_the_engine_cannot_note_it(
         execute(store, source, "walk.fault=input")
 
 
+def test_an_engine_that_fails_stops_no_run(engine, store, source, monkeypatch, caplog):
+    class Overrun:
+        def with_options(self, **options):
+            return self
+
+        def __call__(self, *arguments, **options):
+            raise ConnectionError("503 Service Unavailable")
+
+    monkeypatch.setattr("flows.tasks.STAGE_TASK", Overrun())
+    _, made = execute(store, source, "walk.fault=io", "walk.faults=1")
+    assert sorted(made) == ["digits", "total", "walk"]
+    assert not any(stored.is_cached for stored in made.values())
+    assert caplog.text.count("the engine failed (503 Service Unavailable)") == 3
+
+
+def test_a_flow_that_cannot_end_has_its_artifacts(engine, store, source, monkeypatch):
+    from prefect import flow_engine
+
+    def refuse(client, state, **rest):
+        raise ConnectionError("503 Service Unavailable")
+
+    monkeypatch.setattr(flow_engine, "propose_state_sync", refuse)
+    _, made = execute(store, source)
+    assert sorted(made) == ["digits", "total", "walk"]
+
+
 def test_failed_run_writes_nothing_of_it_to_the_engines_home(engine, store, source):
     from prefect.settings import PREFECT_LOCAL_STORAGE_PATH
 
