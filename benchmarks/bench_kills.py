@@ -141,12 +141,15 @@ class Round:
         self._draw.shuffle(subjects)
         first, second = subjects
         first.until_inside(stage, self._moment(stage))
+        first.look()
+        was_over = first.is_over
         # The other one is alive and may hold locks: harm is judged when it is gone as well.
         first.kill(signal.SIGKILL, whole_group=self._draw.random() < 0.5)
         first.process.wait()
         second.until_inside(stage, self._moment(stage))
         self._note(strike(second, self._draw, BESIDE))
-        self._note(_examine(first, signal.SIGKILL, BESIDE))
+        if not was_over:
+            self._note(_examine(first, signal.SIGKILL, BESIDE))
 
     def kill_publishing(self, stage: str) -> None:
         """While a stage's artifact is published."""
