@@ -36,7 +36,7 @@ MIN_FREE_MIB = 256  # a standard run writes about half of it; a full disk also b
 LOCK_POLL_S = 0.2
 LOCK_TIMEOUT_S = 6 * 3600.0  # longer than the longest stage; a waiter must not outlive its use
 FULL_DISK = frozenset({errno.ENOSPC, errno.EDQUOT})
-READ_ONLY = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
+UNWRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR})
 
 Compute = Callable[[Path, Path], Mapping[str, Any]]
 
@@ -302,7 +302,7 @@ class Store:
 
     def _is_forbidden(self, error: OSError) -> bool:
         is_ours = error.filename is not None and Path(error.filename).is_relative_to(self.root)
-        return error.errno in READ_ONLY and is_ours
+        return error.errno in UNWRITABLE and is_ours
 
 
 def is_disk_full(error: BaseException) -> bool:

@@ -75,6 +75,7 @@ def resume(source: Path, *, config: StageConfig, ctx: Context) -> Text:
 def test_resumed_stage_says_so_and_one_that_had_to_start_anew_does_not(tmp_path, is_sound):
     store = Store(tmp_path)
     work = store.work(recipe("resume").key)
+    work.mkdir(parents=True)
     Checkpoints(work).save(7, {"x": torch.zeros(3)})
     if not is_sound:
         (work / "checkpoint.safetensors").write_bytes(b"whatever")
@@ -88,7 +89,7 @@ def test_resumed_stage_says_so_and_one_that_had_to_start_anew_does_not(tmp_path,
     )
     assert Text.load(stored.folder).value == ("resumed" if is_sound else "new")
     kinds = [event["kind"] for event in stored.manifest.record["events"]]
-    assert kinds == (["resumed"] if is_sound else [])
+    assert kinds == (["resumed"] if is_sound else ["damaged_checkpoint"])
 
 
 def test_device_is_chosen_by_what_there_is():
