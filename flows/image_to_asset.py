@@ -18,7 +18,7 @@ from prefect.states import Failed
 from flows.heartbeats import heartbeats_if_deployed
 from flows.plan import Plan, Verdict
 from flows.recording import Audience
-from flows.run_records import RunRecord
+from flows.run_records import RunRecord, in_a_line
 from flows.showing import Showcase, is_watched
 from flows.steps import RETRY_DELAYS_S, Bench, obtain_steps
 from flows.tasks import run_step
@@ -71,7 +71,7 @@ def run_plan(
             # Raised, it would be written to Prefect's home, for nobody; and where the store has
             # gone, that would be in the way of its return.
             faults.append(fault)
-            return Failed(message=f"{type(fault).__name__}: {fault}")
+            return Failed(message=in_a_line(fault))
         finally:
             if runtime.flow_run.parent_flow_run_id is None:  # others' server goes on
                 _await_records(tried)

@@ -27,6 +27,7 @@ from flows.run_records import (
     RunIndex,
     RunRecord,
     StageRecord,
+    in_a_line,
     new_id,
 )
 from stages.errors import TransientError
@@ -139,7 +140,7 @@ class RunRecorder:
             state = CANCELLED  # by the keyboard, the system, or whoever runs a deployment
             log.warning("cancelled")
         elif error is not None:
-            state, line = FAILED, _in_a_line(error)
+            state, line = FAILED, in_a_line(error)
             log.error(line, exc_info=error)
         self._change(state=state, error=line, ended=time.time())
         log.info("%s after %.1f s", state, self.record.duration_s)
@@ -176,7 +177,7 @@ class RunRecorder:
 
     def failed(self, step: Step, error: BaseException) -> None:
         """A stage failed; it may be tried again."""
-        line = _in_a_line(error)
+        line = in_a_line(error)
         events = (*self.record.stages[step.node.name].events, line)
         self._change(**self._stage(step.node.name, state=FAILED, events=events))
         log.warning(line)
@@ -241,10 +242,6 @@ def _planned(step: Step) -> StageRecord:
     is_wanted = step.verdict in states
     key = step.recipe.key if step.recipe and is_wanted else None
     return StageRecord(key, states.get(step.verdict, str(step.verdict)))
-
-
-def _in_a_line(error: BaseException) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 class _RunLog(logging.FileHandler):

@@ -30,6 +30,11 @@ MAX_NAME = 20  # of the folder's name in an id
 ID = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 
 
+def in_a_line(error: BaseException) -> str:
+    """A fault as pages, logs and servers tell it."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
 @dataclass(frozen=True)
 class StageRecord:
     """One stage of a run.

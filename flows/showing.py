@@ -23,7 +23,7 @@ from prefect.settings import get_current_settings
 from flows.pace import Pace
 from flows.pages import PICTURE_BYTES, product_stages, run_page, stage_page
 from flows.plan import Plan, Step
-from flows.run_records import RunRecord
+from flows.run_records import RunRecord, in_a_line
 from flows.runs import in_short
 from stages.base import Progress
 from stages.store import Stored
@@ -74,7 +74,7 @@ class Showcase:
     ) -> None:
         """Add the page of the run as a whole, and wait until all is sent."""
         self._task_run = None
-        line = "" if error is None else " ".join(f"{type(error).__name__}: {error}".split())
+        line = "" if error is None else in_a_line(error)
         self._to_send.put(lambda client: self._show_run(client, line))
         self._to_send.put(None)
         self._thread.join(LAST_PAGES_S)
@@ -106,7 +106,7 @@ class Showcase:
 
     def started(self, step: Step) -> None:
         """A stage begins to compute."""
-        self._task_run = UUID(str(runtime.task_run.id))
+        self._task_run = _task_run()
 
     def progressed(self, progress: Progress) -> None:
         """A stage has done some of its steps."""
@@ -117,7 +117,7 @@ class Showcase:
 
     def finished(self, step: Step, stored: Stored) -> None:
         """A stage's artifact is in the store."""
-        task_run = UUID(str(runtime.task_run.id))
+        task_run = _task_run()
         self._artifacts[step.node.name] = stored
         self._progress = self._task_run = None
         self._to_send.put(lambda client: self._show_stage(client, step, stored, task_run))
@@ -166,7 +166,7 @@ class Showcase:
         self._bar = client.create_artifact(bar).id
 
     def _show_stage(
-        self, client: SyncPrefectClient, step: Step, stored: Stored, task_run: UUID
+        self, client: SyncPrefectClient, step: Step, stored: Stored, task_run: UUID | None
     ) -> None:
         if self._bar is not None:
             about = f"{step.node.name}: done"
@@ -198,3 +198,9 @@ class Showcase:
                 task_run_id=task_run,
             )
         )
+
+
+def _task_run() -> UUID | None:
+    """The task that calls; None where a stage goes on without the engine."""
+    task = TaskRunContext.get()
+    return task.task_run.id if task else None
