@@ -62,7 +62,7 @@ def train(options: argparse.Namespace) -> int:
             ctx,
             embedded=not from_scratch,
         )
-    if from_scratch and not _expect(folder, clips, config, time_left_s()):
+    if not _expect(folder, clips, config, from_scratch, time_left_s()):
         console.print(f"{folder.root}: the expectation is half trained; run the same again")
         return DONE
     model = folder.reread_model()
@@ -112,16 +112,19 @@ def _expect(
     folder: "TrainingFolder",
     clips: Sequence[Path],
     config: TrainingConfig,
+    from_scratch: bool,
     stop_after_s: float | None,
 ) -> bool:
-    """Let the folder's model have a trained expectation, if it has one; False if stopped before."""
+    """Train the expectation of the folder's model, if it has one; False if stopped before."""
     from stages.expectation_training import train_expectation
 
     model = folder.reread_model()
-    if model.expectation is None:
+    steps = config.expectation.steps if from_scratch else config.expectation.steps_on
+    if model.expectation is None or not steps:
         return True
+    settings = config.expectation.model_copy(update={"steps": steps})
     with folder.context("expectation", config.generator.checkpoint_every_s) as ctx:
-        left_open = train_expectation(model, clips, config.expectation, ctx, stop_after_s)
+        left_open = train_expectation(model, clips, settings, ctx, stop_after_s)
     if left_open not in (None, model.spec.residual_scale):
         folder.keep_model(model.described(residual_scale=left_open))
     return left_open is not None

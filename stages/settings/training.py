@@ -40,7 +40,9 @@ class ExpectationTrainingConfig(StageConfig):
     """The regression whose residual the generator diffuses, of a model that has one."""
 
     steps: PositiveInt = 8000
-    """Optimiser steps."""
+    """Optimiser steps of a model that is trained from nothing."""
+    steps_on: NonNegativeInt = 0
+    """The same of a model folder that is trained on; 0 leaves its expectation as it is."""
     batch: PositiveInt = 64
     """Clips of a step."""
     rate: PositiveFloat = 1e-3

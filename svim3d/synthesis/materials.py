@@ -10,9 +10,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from svim3d.color import linear_from_srgb
 from svim3d.numerics import saturate
 from svim3d.synthesis.dice import Dice
+from svim3d.synthesis.matter import (
+    EARTH,
+    QUIET,
+    RUST,
+    WOODS,
+    Matter,
+    random_colour,
+    random_dielectric,
+    random_metal,
+    shaded,
+    srgb,
+)
 from svim3d.synthesis.patterns import (
     Bands,
     Checks,
@@ -27,23 +38,7 @@ from svim3d.synthesis.patterns import (
     unit,
 )
 
-Colour = tuple[float, float, float]
 Vector = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Matter:
-    """One kind of stuff.
-
-    Attributes:
-        basecolor: linear.
-        roughness: perceptual.
-        metallic: in [0, 1].
-    """
-
-    basecolor: Colour
-    roughness: float
-    metallic: float
 
 
 @dataclass(frozen=True)
@@ -81,76 +76,6 @@ class SolidMaterial:
 
 def _row(matter: Matter, like: Tensor) -> Float[Tensor, "5"]:
     return like.new_tensor([*matter.basecolor, matter.roughness, matter.metallic])
-
-
-# Linear reflectance of polished metals at normal incidence, mean over the three bands.
-METALS: tuple[Colour, ...] = (
-    (0.56, 0.57, 0.58),  # iron
-    (0.91, 0.92, 0.92),  # aluminium
-    (0.55, 0.56, 0.55),  # chromium
-    (0.96, 0.64, 0.54),  # copper
-    (1.00, 0.78, 0.34),  # gold
-    (0.89, 0.76, 0.44),  # brass
-    (0.97, 0.96, 0.91),  # silver
-    (0.30, 0.31, 0.33),  # gunmetal
-)
-WOODS = ("#8a5a34", "#b5834f", "#5b3a22", "#c9a06c", "#a0522d")
-RUST = ("#6e3318", "#8b4a20", "#4c2412")
-EARTH = ("#6b5a48", "#8f7a61", "#4a4038", "#a69884", "#3b342e")
-
-
-def srgb(text: str) -> Colour:
-    """Linear colour of #rrggbb."""
-    r, g, b = linear_from_srgb(
-        torch.tensor([int(text[i : i + 2], 16) / 255.0 for i in (1, 3, 5)])
-    ).tolist()
-    return r, g, b
-
-
-def from_hue(hue: float, saturation: float, value: float) -> Colour:
-    """Linear colour of sRGB-encoded hue (turns), saturation and value."""
-    wheel = (torch.tensor([0.0, 2.0, 1.0]) / 3.0 + hue + 1.0) % 1.0 * 6.0
-    encoded = value * (1.0 - saturation * (1.0 - saturate((wheel - 3.0).abs() - 1.0)))
-    r, g, b = linear_from_srgb(encoded).tolist()
-    return r, g, b
-
-
-def shaded(colour: Colour, factor: float) -> Colour:
-    """A darker or lighter kind of a colour; linear, never above 0.95."""
-    r, g, b = (min(0.95, channel * factor) for channel in colour)
-    return r, g, b
-
-
-def random_colour(dice: Dice) -> Colour:
-    """Colour of paint, plastic or cloth: saturated, muted, pastel, white, grey or black."""
-    kind = dice.choice(
-        ("bright", "muted", "pastel", "white", "grey", "black"), (4.0, 3.0, 1.5, 1.5, 1.0, 1.3)
-    )
-    hue = dice.uniform(0.0, 1.0)
-    if kind == "bright":
-        return from_hue(hue, dice.uniform(0.7, 1.0), dice.uniform(0.55, 0.95))
-    if kind == "muted":
-        return from_hue(hue, dice.uniform(0.3, 0.6), dice.uniform(0.3, 0.75))
-    if kind == "pastel":
-        return from_hue(hue, dice.uniform(0.12, 0.35), dice.uniform(0.8, 0.95))
-    value = {"white": (0.85, 0.95), "grey": (0.35, 0.7), "black": (0.08, 0.2)}[kind]
-    return from_hue(hue, dice.uniform(0.0, 0.08), dice.uniform(*value))
-
-
-def random_dielectric(dice: Dice) -> Matter:
-    """Plastic, paint, ceramic, rubber, stone: no metal, from glossy to dull."""
-    finish = dice.choice(("gloss", "satin", "dull"), (1.0, 1.0, 1.3))
-    roughness = {"gloss": (0.08, 0.3), "satin": (0.3, 0.55), "dull": (0.55, 0.95)}[finish]
-    return Matter(random_colour(dice), dice.uniform(*roughness), 0.0)
-
-
-def random_metal(dice: Dice) -> Matter:
-    """Bare, brushed or tinted metal."""
-    colour = dice.choice(METALS)
-    if dice.chance(0.2):
-        colour = from_hue(dice.uniform(0.0, 1.0), dice.uniform(0.4, 0.8), dice.uniform(0.6, 0.95))
-    colour = shaded(colour, dice.uniform(0.75, 1.0))
-    return Matter(colour, dice.choice((dice.uniform(0.08, 0.3), dice.uniform(0.3, 0.6))), 1.0)
 
 
 def random_material(dice: Dice) -> SolidMaterial:
@@ -208,8 +133,9 @@ def metal(dice: Dice) -> SolidMaterial:
 
 def wooden(dice: Dice) -> SolidMaterial:
     """Wood: year rings, fine grain along the log, sometimes varnished or painted in part."""
-    colour = srgb(dice.choice(WOODS))
-    gloss = dice.choice((dice.uniform(0.15, 0.35), dice.uniform(0.5, 0.8)))
+    wood, varnished = dice.choice(WOODS)
+    colour = srgb(wood)
+    gloss = dice.uniform(*((0.15, 0.35) if dice.chance(varnished) else (0.5, 0.8)))
     base = Matter(colour, gloss, 0.0)
     axis = random_axis(dice)
     dark = Matter(shaded(colour, dice.uniform(0.3, 0.6)), min(1.0, gloss + 0.1), 0.0)
@@ -223,9 +149,11 @@ def wooden(dice: Dice) -> SolidMaterial:
 
 
 def stone(dice: Dice) -> SolidMaterial:
-    """Stone and clay: mottled, veined or speckled."""
-    colour = dice.choice((srgb(dice.choice(EARTH)), random_colour(dice)))
-    base = Matter(colour, dice.choice((dice.uniform(0.1, 0.3), dice.uniform(0.6, 0.95))), 0.0)
+    """Raw stone and clay, or coloured stone that is mostly polished: mottled, veined, speckled."""
+    is_raw = dice.chance(0.5)
+    colour = srgb(dice.choice(EARTH)) if is_raw else random_colour(dice)
+    is_polished = dice.chance(0.15 if is_raw else 0.75)
+    base = Matter(colour, dice.uniform(*((0.1, 0.3) if is_polished else (0.6, 0.95))), 0.0)
     light, dark = shaded(colour, dice.uniform(1.3, 2.2)), shaded(colour, dice.uniform(0.25, 0.6))
     mottling = patches(dice, frequency=dice.uniform(3.0, 9.0), share=0.45)
     layers = [Layer(replace(base, basecolor=light), mottling)]
@@ -273,12 +201,12 @@ def ceramic(dice: Dice) -> SolidMaterial:
 
 def cloth(dice: Dice) -> SolidMaterial:
     """Rough weave, mottled, often striped."""
-    base = Matter(random_colour(dice), dice.uniform(0.8, 1.0), 0.0)
+    base = Matter(random_colour(dice, QUIET), dice.uniform(0.8, 1.0), 0.0)
     f = dice.uniform(20.0, 40.0)
     weave = Patches((f, f, f), 1, 0.5, 0.4, dice.integer(0, 1 << 20))
     layers = [Layer(replace(base, basecolor=shaded(base.basecolor, 0.7)), weave)]
     if dice.chance(0.5):
-        layers.append(Layer(replace(base, basecolor=random_colour(dice)), bands(dice), 0.9))
+        layers.append(Layer(replace(base, basecolor=random_colour(dice, QUIET)), bands(dice), 0.9))
     return SolidMaterial(base, tuple(layers))
 
 

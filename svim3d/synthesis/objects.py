@@ -12,12 +12,11 @@ from svim3d.synthesis.bodies import Part
 from svim3d.synthesis.dice import Dice
 from svim3d.synthesis.materials import (
     Layer,
-    Matter,
     SolidMaterial,
-    random_colour,
     random_material,
     with_decal,
 )
+from svim3d.synthesis.matter import Matter, random_colour
 from svim3d.synthesis.recipes import RECIPES
 from svim3d.synthesis.shapes import Assembly, assemble
 

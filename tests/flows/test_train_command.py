@@ -89,10 +89,16 @@ def test_pieces_leave_the_same_model(data, spec, tmp_path):
         assert (whole / file).read_bytes() == (pieces / file).read_bytes(), name
 
 
-def test_an_expectation_is_trained_before_the_generator_and_in_pieces(data, tmp_path):
-    spec = tmp_path / "expecting.json"
-    expecting = replace(EXPECTING, autoencoder=AUTOENCODER)
-    spec.write_text(json.dumps({"format": FORMAT, **asdict(expecting)}))
+@pytest.fixture
+def expecting(tmp_path: Path) -> Path:
+    file = tmp_path / "expecting.json"
+    spec = replace(EXPECTING, autoencoder=AUTOENCODER)
+    file.write_text(json.dumps({"format": FORMAT, **asdict(spec)}))
+    return file
+
+
+def test_an_expectation_is_trained_before_the_generator_and_in_pieces(data, expecting, tmp_path):
+    spec = expecting
     whole, pieces = tmp_path / "whole", tmp_path / "pieces"
     assert main(command(data, whole, spec)) == 0
     # A step each, 3 of the expectation (the last one goes on with the generator) and 4 more.
@@ -138,6 +144,28 @@ def test_training_goes_on_from_a_model_folder_and_its_terms(data, spec, tmp_path
     assert torch.equal(old.autoencoder.analysis.weight, new.autoencoder.analysis.weight)
     for name, value in old.image_encoder.state_dict().items():
         assert torch.equal(value, new.image_encoder.state_dict()[name]), name
+
+
+def test_the_expectation_of_a_model_folder_goes_on_if_asked(data, expecting, tmp_path):
+    assert main(command(data, tmp_path / "first", expecting)) == 0
+    source = tmp_path / "first" / "model"
+    left, whole, pieces = tmp_path / "left", tmp_path / "whole", tmp_path / "pieces"
+    assert main(command(data, left, source)) == 0
+    on = ("--set", "expectation.steps_on=2", "--set", "expectation.warm_up=1")
+    assert main(command(data, whole, source, *on)) == 0
+    for _ in range(6):
+        assert main(command(data, pieces, source, *on, "--minutes", "0")) == 0
+    first, same, one, two = (
+        read_model(folder, torch.device("cpu"))
+        for folder in (source, left / "model", whole / "model", pieces / "model")
+    )
+    assert torch.equal(first.expectation.head.weight, same.expectation.head.weight)
+    assert same.spec.residual_scale == first.spec.residual_scale
+    assert not torch.equal(first.expectation.head.weight, one.expectation.head.weight)
+    assert one.spec.residual_scale not in (first.spec.residual_scale, 0.0)
+    assert one.spec == two.spec
+    for name, value in one.expectation.state_dict().items():
+        assert torch.equal(value, two.expectation.state_dict()[name]), name
 
 
 def test_a_kill_between_checkpoint_and_model_loses_nothing(data, spec, tmp_path, monkeypatch):

@@ -13,7 +13,8 @@ from svim3d.shading.prefilter import PyramidOperator
 from svim3d.synthesis.dice import Dice
 from svim3d.synthesis.examples import FOV_DEG, photograph, render_example
 from svim3d.synthesis.lights import random_light
-from svim3d.synthesis.materials import Layer, Matter, SolidMaterial
+from svim3d.synthesis.materials import Layer, SolidMaterial
+from svim3d.synthesis.matter import Matter
 from svim3d.synthesis.objects import SyntheticObject
 from svim3d.synthesis.patterns import Decal
 from svim3d.synthesis.scenes import mesh_quality, scene_of, scene_of_mesh

@@ -1,5 +1,7 @@
 """Materials as functions of space: noise, patterns, layers, good and low quality."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -7,13 +9,11 @@ from svim3d.color import srgb_from_linear
 from svim3d.synthesis.dice import Dice
 from svim3d.synthesis.materials import (
     Layer,
-    Matter,
     SolidMaterial,
-    from_hue,
     random_material,
-    srgb,
     with_decal,
 )
+from svim3d.synthesis.matter import Matter, from_hue, random_dielectric, random_metal, srgb
 from svim3d.synthesis.noise import fractal_noise, fractal_noise_plainly
 from svim3d.synthesis.objects import (
     EXPORTED,
@@ -131,6 +131,29 @@ def test_low_quality_says_nothing_of_roughness_and_metal(seed):
         rows = material(*surface(200))
         assert bool((rows[:, 3] == EXPORTED.roughness).all())
         assert bool((rows[:, 4] == EXPORTED.metallic).all())
+
+
+def told_by_colour(matters):
+    """Share of the variance of roughness that the 20 nearest of other colours tell."""
+    colours = srgb_from_linear(torch.tensor([m.basecolor for m in matters]))
+    roughness = torch.tensor([m.roughness for m in matters])
+    half = len(matters) // 2
+    nearest = torch.cdist(colours[:half], colours[half:]).topk(20, largest=False).indices
+    told, true = roughness[half:][nearest].mean(1), roughness[:half]
+    return 1.0 - float((told - true).square().mean() / true.var())
+
+
+@pytest.mark.parametrize("make", [random_dielectric, random_metal])
+def test_the_look_of_stuff_tells_of_its_roughness(make):
+    matters = [make(dice(seed)) for seed in range(1000)]
+    roughness = torch.tensor([m.roughness for m in matters])
+    # Known by colour in part, not wholly: both finishes are met in most colours.
+    assert 0.1 < told_by_colour(matters) < 0.7
+    assert float(roughness.min()) < 0.1 and float(roughness.max()) > 0.58
+    # Where finish is drawn apart from colour, nothing is told.
+    shuffled = roughness[torch.randperm(1000, generator=torch.Generator().manual_seed(0))]
+    apart = [replace(m, roughness=float(r)) for m, r in zip(matters, shuffled, strict=True)]
+    assert told_by_colour(apart) < 0.05
 
 
 def test_good_materials_vary():
