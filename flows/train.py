@@ -17,6 +17,7 @@ from flows.config import validated
 from flows.job import DONE
 from flows.stopping import interrupt_on_stop
 from stages.errors import InputError
+from stages.locks import file_lock
 from stages.settings.training import TrainingConfig
 
 if TYPE_CHECKING:
@@ -24,22 +25,20 @@ if TYPE_CHECKING:
     from stages.training_folder import TrainingFolder
 
 TELL_EVERY_S = 30.0
+LOCK = "lock"
 SHOWN_CLIPS = 2  # orbits on a sheet
 
 
 def train(options: argparse.Namespace) -> int:
-    """Train what the command line names; see `svim3d train --help`."""
+    """Train what the command line names; see `svim3d train --help`.
+
+    Raises:
+        InputError: wrong settings, model or data, or another process trains in the folder.
+    """
     config = load_training_config(options.config, options.set)
     from stages.execution import choose_device
-    from stages.generator_training import train_generator
-    from stages.latents import precompute_latents, read_fitting
+    from stages.latents import read_fitting
     from stages.training_folder import TrainingFolder, examples_of, load_model_spec
-    from stages.training_sheet import draw_generator_sheet
-
-    over_s = None if options.minutes is None else time.monotonic() + 60.0 * options.minutes
-
-    def time_left_s() -> float | None:
-        return None if over_s is None else max(0.0, over_s - time.monotonic())
 
     examples = examples_of(options.data)
     spec = load_model_spec(options.model)
@@ -47,12 +46,38 @@ def train(options: argparse.Namespace) -> int:
     folder = TrainingFolder(
         options.output, options.seed, choose_device(options.device), _Teller(console)
     )
-    folder.require_same(config, spec, examples[0])
-    read_fitting(examples[0], spec)
-    from_scratch = not options.model.is_dir()
-    interrupt_on_stop()
+    with file_lock(folder.root / LOCK) as is_ours:
+        if not is_ours:
+            raise InputError(
+                f"another process trains in {folder.root}; wait for it, or take another folder"
+            )
+        folder.require_same(config, spec, examples[0])
+        read_fitting(examples[0], spec)
+        interrupt_on_stop()
+        over_s = None if options.minutes is None else time.monotonic() + 60.0 * options.minutes
+        _train(folder, options.model, examples, config, over_s, console)
+    return DONE
+
+
+def _train(
+    folder: "TrainingFolder",
+    source: Path,
+    examples: Sequence[Path],
+    config: TrainingConfig,
+    over_s: float | None,
+    console: Console,
+) -> None:
+    """Every part in turn; `over_s` is the moment to stop at."""
+    from stages.generator_training import train_generator
+    from stages.latents import precompute_latents
+    from stages.training_sheet import draw_generator_sheet
+
+    def time_left_s() -> float | None:
+        return None if over_s is None else max(0.0, over_s - time.monotonic())
+
+    from_scratch = not source.is_dir()
     every_s = config.generator.checkpoint_every_s
-    _start(folder, options.model, examples, config)
+    _start(folder, source, examples, config)
     with folder.context("latents", every_s) as ctx:
         clips = precompute_latents(
             folder.reread_model(),
@@ -64,7 +89,7 @@ def train(options: argparse.Namespace) -> int:
         )
     if not _expect(folder, clips, config, from_scratch, time_left_s()):
         console.print(f"{folder.root}: the expectation is half trained; run the same again")
-        return DONE
+        return
     model = folder.reread_model()
     with folder.context("generator", every_s) as ctx:
         steps = train_generator(
@@ -87,7 +112,6 @@ def train(options: argparse.Namespace) -> int:
     console.print(
         f"{folder.model_folder}: a model for svim3d run --model", highlight=False, soft_wrap=True
     )
-    return DONE
 
 
 def _start(

@@ -9,6 +9,8 @@ import torch
 from tiny_model import EXPECTING, TINY
 
 from flows.cli import main
+from flows.train import LOCK
+from stages.locks import file_lock
 from stages.training_folder import TrainingFolder
 from svim3d.io.model_folder import FORMAT, read_model
 from svim3d.io.training_data import write_example
@@ -185,6 +187,16 @@ def test_a_kill_between_checkpoint_and_model_loses_nothing(data, spec, tmp_path,
     for name in ("unet", "autoencoder", "image_encoder"):
         file = f"model/{name}.safetensors"
         assert (whole / file).read_bytes() == (killed / file).read_bytes(), name
+
+
+def test_two_trainings_do_not_meet_in_a_folder(data, spec, tmp_path, capsys):
+    out = tmp_path / "run"
+    with file_lock(out / LOCK) as is_held:
+        assert is_held
+        assert main(command(data, out, spec)) == 2
+    assert "another process trains in" in capsys.readouterr().err
+    assert not (out / "model").exists()
+    assert main(command(data, out, spec)) == 0
 
 
 @pytest.mark.parametrize(
