@@ -6,6 +6,7 @@ step costs a hundredth of the generator's and batches can be large.
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -17,17 +18,20 @@ from stages.errors import InputError
 from stages.precision import products_in
 from stages.settings.training import ExpectationTrainingConfig
 from stages.training_batches import SeenClip, draw_seen
+from svim3d.diffusion.autoencoder import decode
 from svim3d.diffusion.clips import StoredClip
 from svim3d.diffusion.expectation import Expectation
 from svim3d.diffusion.groups import GROUPS
 from svim3d.diffusion.model import MaterialDiffusion
-from svim3d.diffusion.training import weighted_loss
+from svim3d.diffusion.training import material_difference, weighted_loss
 from svim3d.io.clip_file import read_clip
 from svim3d.optim import NamedAdam, Rate, cosine
 
 ADAM_EPS = 1e-8
 FINAL_RATE = 0.01
 SCALE_BATCHES = 32  # what the residual's scale is measured on
+SHOWN = ("orm", "normal")  # groups that tell materials, and where the object is
+DECODED = 16  # clips of a batch whose materials are looked at: decoding costs as much as the rest
 
 
 def train_expectation(
@@ -74,9 +78,15 @@ def train_expectation(
             ctx.checkpoints.save(step, adam.state())
             if is_over:
                 return None
-        errors, good = _errors(model, expectation, clips, f"step {step}", config, ctx)
-        loss = weighted_loss(errors, good)
+        batch = _Batch.draw(model, clips, f"step {step}", config, ctx)
+        answer = batch.answer(expectation, config)
+        errors = batch.errors(answer)
+        loss = weighted_loss(errors, batch.good)
         terms = dict(zip(GROUPS, errors.detach().mean(0).tolist(), strict=True))
+        if config.material_weight:
+            materials = batch.material_error(answer, model, ctx.generator(f"frames {step}"))
+            loss = loss + config.material_weight * materials
+            terms["materials"] = float(materials.detach())
         if ctx.is_finite(step, {"loss": loss}):
             adam.zero_grad()
             loss.backward()
@@ -90,28 +100,81 @@ def train_expectation(
     return _left_open(model, expectation, clips, config, ctx)
 
 
-def _errors(
-    model: MaterialDiffusion,
-    expectation: Expectation,
-    clips: Sequence[StoredClip],
-    name: str,
-    config: ExpectationTrainingConfig,
-    ctx: Context,
-) -> tuple[Float[Tensor, "b groups"], Bool[Tensor, "b"]]:
-    """Mean squared errors of a random batch, and whose materials can be trusted."""
-    generator = ctx.generator(name)
-    seen = draw_seen(clips, config.batch, generator)
-    keep = (torch.rand(config.batch, generator=generator) >= config.drop_share).float()
-    latents = _stacked(seen, "latents", ctx) * model.spec.latent_scale
-    keep = keep.view(-1, 1, 1, 1).to(ctx.device)
-    reference = _stacked(seen, "reference", ctx) * keep
-    picture = _stacked(seen, "picture", ctx) * keep
-    camera = torch.stack([one.camera(model.spec) for one in seen]).to(ctx.device)
-    with products_in(config.precision, ctx.device):
-        answer = expectation(reference, picture, camera)
-    squares = (answer.float() - latents) ** 2
-    good = torch.tensor([one.clip.has_good_materials for one in seen], device=ctx.device)
-    return squares.unflatten(2, (len(GROUPS), -1)).mean((1, 3, 4, 5)), good
+@dataclass(frozen=True)
+class _Batch:
+    """Random clips in random lights, each seen from one of its frames.
+
+    Attributes:
+        reference: latent of the view that is seen; zero where it is withheld.
+        picture: that view; likewise.
+        camera: of each frame.
+        latents: what is to be told, of unit variance.
+        good: whose materials can be trusted.
+    """
+
+    reference: Float[Tensor, "b z h w"]
+    picture: Float[Tensor, "b 3 t t"]
+    camera: Float[Tensor, "b k 3"]
+    latents: Float[Tensor, "b k c h w"]
+    good: Bool[Tensor, "b"]
+
+    @classmethod
+    def draw(
+        cls,
+        model: MaterialDiffusion,
+        clips: Sequence[StoredClip],
+        name: str,
+        config: ExpectationTrainingConfig,
+        ctx: Context,
+    ) -> "_Batch":
+        """The batch of this name."""
+        generator = ctx.generator(name)
+        seen = draw_seen(clips, config.batch, generator)
+        keep = (torch.rand(config.batch, generator=generator) >= config.drop_share).float()
+        keep = keep.view(-1, 1, 1, 1).to(ctx.device)
+        return cls(
+            reference=_stacked(seen, "reference", ctx) * keep,
+            picture=_stacked(seen, "picture", ctx) * keep,
+            camera=torch.stack([one.camera(model.spec) for one in seen]).to(ctx.device),
+            latents=_stacked(seen, "latents", ctx) * model.spec.latent_scale,
+            good=torch.tensor([one.clip.has_good_materials for one in seen], device=ctx.device),
+        )
+
+    def answer(
+        self, expectation: Expectation, config: ExpectationTrainingConfig
+    ) -> Float[Tensor, "b k c h w"]:
+        """What is expected of it."""
+        with products_in(config.precision, self.latents.device):
+            return expectation(self.reference, self.picture, self.camera).float()
+
+    def errors(self, answer: Float[Tensor, "b k c h w"]) -> Float[Tensor, "b groups"]:
+        """Mean squared errors."""
+        squares = (answer - self.latents) ** 2
+        return squares.unflatten(2, (len(GROUPS), -1)).mean((1, 3, 4, 5))
+
+    def material_error(
+        self,
+        answer: Float[Tensor, "b k c h w"],
+        model: MaterialDiffusion,
+        generator: torch.Generator,
+    ) -> Float[Tensor, ""]:
+        """Of a random frame of clips that can be trusted, decoded; at most `DECODED` of them."""
+        clips = self.good.nonzero()[:DECODED, 0]
+        if not len(clips):
+            return answer.new_zeros(())
+        count = answer.shape[1]
+        frames = torch.randint(count, (len(clips),), generator=generator).to(clips.device)
+        told, true = (
+            {name: self._decoded(side[clips, frames], name, model) for name in SHOWN}
+            for side in (answer, self.latents)
+        )
+        difference = material_difference(told, true, model.spec.normal_length)
+        return difference.mean()
+
+    @staticmethod
+    def _decoded(latents: Tensor, group: str, model: MaterialDiffusion) -> Tensor:
+        chosen = latents.unflatten(1, (len(GROUPS), -1))[:, GROUPS.index(group)]
+        return decode(model.autoencoder, chosen / model.spec.latent_scale, chunk=DECODED)
 
 
 def _stacked(seen: Sequence[SeenClip], what: str, ctx: Context) -> Tensor:
@@ -126,8 +189,8 @@ def _left_open(
     config: ExpectationTrainingConfig,
     ctx: Context,
 ) -> float:
-    squares = [
-        _errors(model, expectation, clips, f"scale {batch}", config, ctx)[0].mean()
-        for batch in range(SCALE_BATCHES)
-    ]
+    squares = []
+    for number in range(SCALE_BATCHES):
+        batch = _Batch.draw(model, clips, f"scale {number}", config, ctx)
+        squares.append(batch.errors(batch.answer(expectation, config)).mean())
     return float(torch.stack(squares).mean().sqrt())

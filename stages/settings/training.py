@@ -51,6 +51,9 @@ class ExpectationTrainingConfig(StageConfig):
     """Steps over which the rate rises."""
     clip: PositiveFloat = 1.0
     """Largest norm of a step's gradient."""
+    material_weight: NonNegativeFloat = 0.0
+    """Weight of absolute differences of decoded roughness and metallic; latents hardly tell them
+    from all else, so that squared errors of latents alone leave them at their mean."""
     drop_share: Share = 0.1
     """Share of clips that do not see the reference view."""
     precision: Precision = "auto"

@@ -13,11 +13,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from svim3d.diffusion.conditioning import Conditioning
-from svim3d.diffusion.groups import GROUPS
+from svim3d.diffusion.groups import FULL_COVERAGE, GROUPS, coverage
 from svim3d.diffusion.karras import c_in, c_noise, draw_noise_levels, over_batch, velocity
 from svim3d.diffusion.unet import MaterialVideoUNet
 
 MATERIAL_GROUPS = ("basecolor", "orm")  # what a clip with poor materials must not teach
+# Where an answer covers less of a pixel, it has hardly told what the pixel is made of.
+TOLD_COVERAGE = 0.3
 # What ends each branch of a temporal transformer; zero here, and frames do not meet.
 TEMPORAL_EXITS = ("ff_in.net.2", "attn1.to_out.0", "attn2.to_out.0", "ff.net.2")
 
@@ -109,6 +111,33 @@ def weighted_loss(
     trusted = has_good_materials[:, None] | ~is_material[None]
     weights = trusted.to(errors)
     return ((errors * weights).sum(1) / weights.sum(1)).mean()
+
+
+def material_difference(
+    answer: Mapping[str, Float[Tensor, "n 3 H W"]],
+    truth: Mapping[str, Float[Tensor, "n 3 H W"]],
+    normal_length: float,
+) -> Float[Tensor, "n"]:
+    """Absolute differences of roughness and metallic, summed, mean over the object's pixels.
+
+    Absolute, because matter is metal or it is not: the mean of both is wrong either way, and the
+    median is what most of it is. Pictures without an object give zero.
+
+    Args:
+        answer: decoded groups `orm` and `normal`, in [-1, 1].
+        truth: the same of what was to be told.
+        normal_length: of the answer's normals, see `coverage`.
+    """
+    told, told_normal, true, true_normal = (
+        ((side[name] + 1.0) / 2.0).movedim(1, -1)
+        for side in (answer, truth)
+        for name in ("orm", "normal")
+    )
+    share = coverage(told_normal, normal_length).detach()
+    inside = ((coverage(true_normal) > FULL_COVERAGE) & (share > TOLD_COVERAGE)).to(told)[..., 0]
+    straight = told[..., 1:] / share.clamp(min=TOLD_COVERAGE)
+    difference = (straight - true[..., 1:]).abs().sum(-1) * inside
+    return difference.sum((1, 2)) / inside.sum((1, 2)).clamp(min=1.0)
 
 
 def separate_frames(unet: MaterialVideoUNet) -> None:

@@ -1,5 +1,6 @@
 """Training the expectation: it learns what follows from the reference view, and resumes exactly."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -38,7 +39,11 @@ def turning_clip(seed: int) -> StoredClip:
 
 
 def run(
-    folder: Path, clips: list[StoredClip], steps: int, stop_after_s: float | None = None
+    folder: Path,
+    clips: list[StoredClip],
+    steps: int,
+    stop_after_s: float | None = None,
+    material_weight: float = 0.0,
 ) -> tuple[MaterialDiffusion, float | None]:
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / f"{i}.safetensors" for i in range(len(clips))]
@@ -46,7 +51,13 @@ def run(
         write_clip(file, clip)
     model = tiny_model(EXPECTING)
     config = ExpectationTrainingConfig(
-        steps=steps, batch=16, rate=5e-3, warm_up=5, drop_share=0.0, precision="float32"
+        steps=steps,
+        batch=16,
+        rate=5e-3,
+        warm_up=5,
+        drop_share=0.0,
+        precision="float32",
+        material_weight=material_weight,
     )
     with Context("training expectation", CPU, 0, folder / "work", folder / "shared") as ctx:
         return model, train_expectation(model, files, config, ctx, stop_after_s=stop_after_s)
@@ -73,14 +84,25 @@ def test_it_learns_what_follows_from_the_reference_view(tmp_path):
 
 def test_pieces_end_like_one_run(tmp_path):
     clips = [turning_clip(0), turning_clip(1)]
-    whole, scale = run(tmp_path / "whole", clips, 4)
+    whole, scale = run(tmp_path / "whole", clips, 4, material_weight=1.0)
     for _ in range(3):
-        _, unknown = run(tmp_path / "pieces", clips, 4, stop_after_s=0.0)
+        _, unknown = run(tmp_path / "pieces", clips, 4, stop_after_s=0.0, material_weight=1.0)
         assert unknown is None
-    pieces, same = run(tmp_path / "pieces", clips, 4, stop_after_s=0.0)
+    pieces, same = run(tmp_path / "pieces", clips, 4, stop_after_s=0.0, material_weight=1.0)
     assert scale == same
     for name, value in whole.expectation.state_dict().items():
         assert torch.equal(value, pieces.expectation.state_dict()[name]), name
+
+
+def test_materials_are_told_where_they_can_be_trusted(tmp_path):
+    """The term is in the losses, and poor materials leave no trace of it in the weights."""
+    good, poor = turning_clip(0), replace(turning_clip(0), has_good_materials=False)
+    run(tmp_path / "good", [good], 3, material_weight=1.0)
+    rows = (tmp_path / "good" / "work" / "scalars.csv").read_text()
+    assert rows.count(",materials,") == 3
+    one, _ = run(tmp_path / "one", [poor], 3, material_weight=1.0)
+    two, _ = run(tmp_path / "two", [poor], 3)
+    assert torch.equal(one.expectation.head.weight, two.expectation.head.weight)
 
 
 def test_the_unet_stays(tmp_path):

@@ -13,6 +13,7 @@ from svim3d.diffusion.training import (
     Clips,
     Draws,
     MovingAverage,
+    material_difference,
     picture_loss,
     separate_frames,
     velocity_errors,
@@ -179,3 +180,34 @@ def test_picture_terms_in_closed_form():
     terms = picture_loss(answer, pictures, edge_weight=2.0)
     assert float(terms["color"]) == pytest.approx(0.5 * 0.5 + 0.5 * 0.25)
     assert float(terms["edges"]) == pytest.approx(2.0 * 0.5 / 3.0)
+
+
+def decoded(roughness, metallic, share=1.0, length=1.0):
+    """Pictures of an object on the left half, in [-1, 1]."""
+    orm, normal = torch.zeros(2, 3, 8, 8), torch.zeros(2, 3, 8, 8)
+    orm[:, 1, :, :4], orm[:, 2, :, :4] = share * roughness, share * metallic
+    facing = torch.tensor([0.0, 0.0, length])
+    normal[..., :4] = share * ((facing + 1.0) / 2.0)[None, :, None, None]
+    return {"orm": 2.0 * orm - 1.0, "normal": 2.0 * normal - 1.0}
+
+
+def test_materials_are_compared_where_the_object_is():
+    truth = decoded(0.4, 1.0)
+    close = {"atol": 1e-5, "rtol": 0.0}
+    same = material_difference(truth, truth, 1.0)
+    torch.testing.assert_close(same, torch.zeros(2), **close)
+    # 0.2 and 0.3 off, whatever share of the pixels the answer covers and however long its normals.
+    for share, length in ((1.0, 1.0), (0.6, 1.0), (0.7, 0.78)):
+        told = decoded(0.6, 0.7, share, length)
+        found = material_difference(told, truth, length)
+        torch.testing.assert_close(found, torch.full((2,), 0.5), **close)
+    # Where hardly anything is told, nothing is compared.
+    faint = decoded(0.6, 0.7, 0.2)
+    assert material_difference(faint, truth, 1.0).tolist() == [0.0, 0.0]
+
+
+def test_outlines_do_not_follow_materials():
+    told = {name: p.clone().requires_grad_() for name, p in decoded(0.6, 0.7, 0.8).items()}
+    material_difference(told, decoded(0.4, 1.0), 1.0).sum().backward()
+    assert told["orm"].grad.abs().sum() > 0.0
+    assert told["normal"].grad is None
