@@ -27,7 +27,7 @@ def generate(model: MaterialDiffusion, case: Case, seed: int, sampling: Sampling
     latents = model.draw(told, seed, sampling)
     if not bool(latents.isfinite().all()):
         raise ValueError(f"wanted finite latents of {case.name}, got others; check the weights")
-    return Views.of_generated(model.decode(latents, sampling))
+    return Views.of_generated(model.decode(latents, sampling, told))
 
 
 @torch.no_grad()

@@ -1,7 +1,7 @@
 """`svim3d train`: rendered examples in, a model folder out; goes on where it was stopped.
 
-Autoencoder, latents, expectation, generator: each part keeps its state in the run's folder, and
-what is done is not done again. `--minutes` cuts a long training into pieces that end like one.
+Autoencoder, look, latents, expectation, generator: each part keeps its state in the run's folder,
+and what is done is not done again. `--minutes` cuts a long training into pieces that end like one.
 """
 
 import argparse
@@ -78,6 +78,7 @@ def _train(
     from_scratch = not source.is_dir()
     every_s = config.generator.checkpoint_every_s
     _start(folder, source, examples, config)
+    _look(folder, examples, config)
     with folder.context("latents", every_s) as ctx:
         clips = precompute_latents(
             folder.reread_model(),
@@ -130,6 +131,20 @@ def _start(
     sheet = folder.root / "autoencoder" / "sheet.png"
     draw_autoencoder_sheet(model.autoencoder, examples[-1], sheet)
     folder.keep_model(model.described(latent_scale=scale))
+
+
+def _look(folder: "TrainingFolder", examples: Sequence[Path], config: TrainingConfig) -> None:
+    """Train the look of the folder's model, if it has one and this run has not done so."""
+    from stages.look_training import train_look
+    from stages.training_folder import LOOK
+
+    model = folder.reread_model()
+    if model.look is None or not config.look.steps or folder.has_look:
+        return
+    with folder.context(LOOK, config.generator.checkpoint_every_s) as ctx:
+        train_look(model, examples, config.look, ctx)
+    folder.keep_model(model)
+    folder.mark_look()
 
 
 def _expect(

@@ -24,8 +24,6 @@ from svim3d.io.clip_file import write_clip
 from svim3d.io.training_data import read_example
 from svim3d.synthesis.example import TrainingExample
 
-GOOD = "good"  # what an example's metadata says of materials that can be trusted
-
 
 def precompute_latents(
     model: MaterialDiffusion,
@@ -115,7 +113,7 @@ def _clip(
         pictures=pictures,
         elevation_deg=torch.stack(elevations[:forms]),
         azimuth_deg=torch.stack(azimuths[:forms]),
-        has_good_materials=example.metadata.get("quality") == GOOD,
+        has_good_materials=example.has_good_materials,
         tokens=_tokens(model, pictures) if embedded else None,
     )
 

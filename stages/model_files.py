@@ -200,7 +200,8 @@ def _describe_folder(folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
     rows = [("kind", "model folder"), ("name", spec.name)]
     shapes: dict[str, dict[str, Shape]] = {}
     types: set[str] = set()
-    for part in (*PARTS, *(["expectation"] if spec.expectation else [])):
+    more = [name for name in ("expectation", "look") if getattr(spec, name)]
+    for part in (*PARTS, *more):
         with open_tensors(folder / f"{part}.safetensors") as tensors:
             shapes[part] = tensors.shapes
             types |= set(tensors.types.values())

@@ -109,7 +109,7 @@ def draw_samples(
                 "the generator's numbers are not finite; try --set generation.dtype=float32, or a "
                 "weaker --set generation.guidance_max"
             )
-        samples.append(_on_cpu(model.decode(latents, sampling)))
+        samples.append(_on_cpu(model.decode(latents, sampling, conditioning)))
     return samples
 
 

@@ -2,6 +2,7 @@
 
 settings.json      settings, model and data that the run was begun with
 autoencoder/       checkpoint and losses; sheet.png
+look/              losses, of a model that has one
 latents/           a clip file per example
 expectation/       checkpoint and losses, of a model that has one
 generator/         checkpoint and losses; sheet-<steps>.png
@@ -26,6 +27,7 @@ from svim3d.diffusion.model import MaterialDiffusion, ModelSpec
 from svim3d.io.model_folder import CARD, DESCRIPTION, read_model, read_spec, write_model
 
 SETTINGS, MODEL, ORIGIN, NOTICE = "settings.json", "model", "origin.md", "NOTICE"
+LOOK, DONE = "look", "done"
 EXAMPLES = "*.safetensors"
 # Settings that may change when a run goes on: they say how long and how often, not how.
 FREE = {
@@ -106,6 +108,15 @@ class TrainingFolder:
     def has_autoencoder(self) -> bool:
         """Whether the autoencoder is done: a model is written once it is."""
         return (self.model_folder / DESCRIPTION).exists()
+
+    @property
+    def has_look(self) -> bool:
+        """Whether this run has trained the look."""
+        return (self.root / LOOK / DONE).exists()
+
+    def mark_look(self) -> None:
+        """The model that is kept holds the look that this run has trained."""
+        (self.root / LOOK / DONE).touch()
 
     def start_model(self, spec: ModelSpec, source: Path) -> MaterialDiffusion:
         """The last checkpoint's weights; or the source's, if it has any; or random ones."""

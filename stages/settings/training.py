@@ -60,6 +60,22 @@ class ExpectationTrainingConfig(StageConfig):
     """Of matrix products: `auto` takes bfloat16 where the device multiplies it."""
 
 
+class LookTrainingConfig(StageConfig):
+    """Mean roughness and metallic from a picture's statistics, of a model that has a look."""
+
+    steps: NonNegativeInt = 2000
+    """Optimiser steps; 0 leaves the look as it is."""
+    batch: PositiveInt = 256
+    """Pictures of a step."""
+    rate: PositiveFloat = 2e-3
+    """Adam's step after warming up; it falls to a hundredth along a cosine."""
+    noise: NonNegativeFloat = 0.3
+    """On the statistics, in standard deviations: keeps a few thousand objects from being learnt
+    by heart."""
+    every_view: PositiveInt = 5
+    """Views of an orbit that are learnt from, in each light: neighbours look alike."""
+
+
 class GeneratorTrainingConfig(StageConfig):
     """The UNet and, if asked for, the image encoder."""
 
@@ -103,4 +119,5 @@ class TrainingConfig(StageConfig):
     autoencoder: AutoencoderTrainingConfig = AutoencoderTrainingConfig()
     latents: LatentsConfig = LatentsConfig()
     expectation: ExpectationTrainingConfig = ExpectationTrainingConfig()
+    look: LookTrainingConfig = LookTrainingConfig()
     generator: GeneratorTrainingConfig = GeneratorTrainingConfig()

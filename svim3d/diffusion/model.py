@@ -33,6 +33,7 @@ from svim3d.diffusion.guidance import (
     weights_by_index,
 )
 from svim3d.diffusion.karras import c_in, c_noise, denoised, noise_levels
+from svim3d.diffusion.look import Look, with_means
 from svim3d.diffusion.prepared import PreparedUNet
 from svim3d.diffusion.sampler import Denoiser, sample, seeded_noise
 from svim3d.diffusion.unet import MaterialVideoUNet
@@ -65,6 +66,8 @@ class ModelSpec:
         residual_scale: what an expectation leaves open, as a standard deviation of latents.
         normal_length: of the normals it decodes inside an object; a model that hesitates answers
             with means of directions, which are shorter than 1.
+        look: arguments of `Look`; None for a model that draws roughness and metallic alone.
+        look_detail: share of the drawn differences that is kept where a look tells the means.
     """
 
     name: str
@@ -87,6 +90,8 @@ class ModelSpec:
     expectation: dict[str, Any] | None = None
     residual_scale: float = 1.0
     normal_length: float = 1.0
+    look: dict[str, Any] | None = None
+    look_detail: float = 1.0
 
     @property
     def latent_side(self) -> int:
@@ -165,7 +170,7 @@ class Sampling:
 
 
 class MaterialDiffusion:
-    """UNet, autoencoder, image encoder and expectation, and how to draw an orbit with them.
+    """UNet, autoencoder, image encoder, expectation and look, and how to draw an orbit with them.
 
     Args:
         spec: what the weights are for.
@@ -173,6 +178,7 @@ class MaterialDiffusion:
         autoencoder: sees one picture of one group at a time.
         image_encoder: sees the reference view.
         expectation: what the UNet's latents are residuals of, if they are.
+        look: tells mean roughness and metallic, if there is one.
     """
 
     def __init__(
@@ -182,12 +188,14 @@ class MaterialDiffusion:
         autoencoder: Autoencoder,
         image_encoder: CLIPVisionModelWithProjection,
         expectation: Expectation | None = None,
+        look: Look | None = None,
     ) -> None:
         self.spec = spec
         self.unet = unet
         self.autoencoder = autoencoder
         self.image_encoder = image_encoder
         self.expectation = expectation
+        self.look = look
 
     @classmethod
     def untrained(cls, spec: ModelSpec) -> "MaterialDiffusion":
@@ -206,22 +214,19 @@ class MaterialDiffusion:
                 groups=len(spec.groups),
                 **spec.expectation,
             ),
+            None if spec.look is None else Look(**spec.look),
         )
 
     def described(self, **changes: Any) -> "MaterialDiffusion":
         """The same networks under a description with other values."""
-        networks = (self.unet, self.autoencoder, self.image_encoder, self.expectation)
-        return MaterialDiffusion(replace(self.spec, **changes), *networks)
+        return MaterialDiffusion(replace(self.spec, **changes), **self.parts)  # type: ignore[arg-type]
 
     @property
     def parts(self) -> dict[str, torch.nn.Module]:
         """The networks by the names of their files."""
-        parts: dict[str, Any] = {
-            "unet": self.unet,
-            "autoencoder": self.autoencoder,
-            "image_encoder": self.image_encoder,
-        }
-        return parts if self.expectation is None else parts | {"expectation": self.expectation}
+        names = ("unet", "autoencoder", "image_encoder", "expectation", "look")
+        parts = {name: getattr(self, name) for name in names}
+        return {name: part for name, part in parts.items() if part is not None}
 
     @property
     def device(self) -> torch.device:
@@ -368,13 +373,18 @@ class MaterialDiffusion:
         self,
         latents: Float[Tensor, "K c h w"],
         sampling: Sampling = Sampling(),
+        conditioning: Conditioning | None = None,
     ) -> GeneratedViews:
-        """The views that latents of unit variance stand for."""
+        """The views that latents stand for, as `draw` gives them; a look asks the conditioning."""
         groups = latents.split(self.spec.latent_channels, 1)
         stacked = torch.cat(groups) / self.spec.latent_scale
         pictures = decode(self.autoencoder, stacked, sampling.decode_at_once).chunk(len(groups))
         named = dict(zip(self.spec.groups, pictures, strict=True))
-        return unpack(named, self.spec.normal_length)
+        views = unpack(named, self.spec.normal_length)
+        if self.look is None or conditioning is None:
+            return views
+        assert conditioning.picture is not None
+        return with_means(views, self.look(conditioning.picture)[0], self.spec.look_detail)
 
     def guidance(self, conditioning: Conditioning, sampling: Sampling) -> Float[Tensor, "K"]:
         """Strength of guidance at each frame."""

@@ -5,6 +5,8 @@ from dataclasses import dataclass, fields
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+GOOD = "good"  # what the metadata says of materials that can be trusted
+
 
 @dataclass(frozen=True)
 class TrainingExample:
@@ -31,6 +33,11 @@ class TrainingExample:
     elevation_deg: Float[Tensor, "K"]
     azimuth_deg: Float[Tensor, "K"]
     metadata: dict[str, str]
+
+    @property
+    def has_good_materials(self) -> bool:
+        """Whether basecolor, roughness and metallic can be trusted."""
+        return self.metadata.get("quality") == GOOD
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name."""

@@ -170,6 +170,23 @@ def test_the_expectation_of_a_model_folder_goes_on_if_asked(data, expecting, tmp
         assert torch.equal(value, two.expectation.state_dict()[name]), name
 
 
+def test_a_look_is_trained_once_and_goes_along(data, tmp_path):
+    file = tmp_path / "looking.json"
+    spec = replace(EXPECTING, autoencoder=AUTOENCODER, look={"hidden": 4})
+    file.write_text(json.dumps({"format": FORMAT, **asdict(spec)}))
+    more = ("--set", "look.steps=5", "--set", "look.batch=4")
+    whole, pieces = tmp_path / "whole", tmp_path / "pieces"
+    assert main(command(data, whole, file, *more)) == 0
+    for _ in range(7):
+        assert main(command(data, pieces, file, *more, "--minutes", "0")) == 0
+    one, two = (read_model(run / "model", torch.device("cpu")) for run in (whole, pieces))
+    assert one.look.centre.any()
+    for name, value in one.look.state_dict().items():
+        assert torch.equal(value, two.look.state_dict()[name]), name
+    rows = (pieces / "look" / "scalars.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows if "roughness" in row] == list("12345")
+
+
 def test_a_kill_between_checkpoint_and_model_loses_nothing(data, spec, tmp_path, monkeypatch):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert main(command(data, whole, spec)) == 0
