@@ -1,6 +1,6 @@
 """Many tiny runs by each way to run many, with workers killed in the middle, beside bare Python.
 
-    python benchmarks/bench_load.py [--runs 200] [--rows bare local dask ray pool]
+    python benchmarks/bench_load.py [--runs 200] [--rows bare local dask ray pool postgres]
                                     [--results FILE] [--chart FILE] [--folder DIR]
 
 A run is the tiny pipeline of the tests: three stages of a few milliseconds, each row in a store of
@@ -8,7 +8,8 @@ its own. `local`, `dask` and `ray` are `svim3d batch --jobs 2`; the worker at wo
 half the assets are there. `pool` is a Prefect server, a process work pool and one worker with two
 jobs at a time that asks for work every two seconds: a job is killed at a quarter, the worker and
 its jobs at half; then another worker is started, and the automations find what was lost. `bare` is
-a loop over the stages with the store.
+a loop over the stages with the store. `postgres` is a pool whose server keeps its records in
+PostgreSQL instead of SQLite.
 
     wall, CPU    seconds from the start of the command, or of the server, to its end; all processes
     first        seconds until the first asset
@@ -42,6 +43,7 @@ from pathlib import Path
 from unittest import mock
 
 from pool_case import PROJECT, TINY, Pool, server, wait_for
+from postgres_case import has_postgres, postgres
 from tiny_batch import TINY_FILES, TinyConfig, start, states
 
 from flows.batch_job import BatchJob
@@ -54,7 +56,7 @@ SETTINGS = ("walk.steps=10",)
 AT_ONCE = 2
 PRODUCT = "total.safetensors"
 LONGEST_S = 3600.0  # of a row
-BARE_SPANS = "spans.json"
+SPANS = "spans.json"
 ADOPT_ORPHANS = 36  # PR_SET_CHILD_SUBREAPER of prctl(2)
 COLUMNS = (
     *("row", "runs", "wall s", "CPU s", "first s", "per min", "run + ms wall", "run + ms CPU"),
@@ -144,7 +146,7 @@ def make_bare(folder: str) -> None:
         artifacts = compute(plan, store)
         spans_s.append(time.perf_counter() - began)
         job.finish(plan, artifacts, store)
-    (scene.folder / BARE_SPANS).write_text(json.dumps(spans_s))
+    (scene.folder / SPANS).write_text(json.dumps(spans_s))
 
 
 def run_bare(scene: Scene) -> int:
@@ -168,13 +170,13 @@ def run_batch(scene: Scene, runner: str) -> int:
     return sum(state not in DONE_STATES for state in states(scene.out).values())
 
 
-def run_pool(scene: Scene) -> int:
+def run_pool(scene: Scene, in_postgres: bool = False) -> int:
     """Runs that did not end well."""
-    with (
-        mock.patch.dict(os.environ),
-        server(scene.folder / "home"),
-        contextlib.ExitStack() as workers,
-    ):
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(mock.patch.dict(os.environ))
+        database = stack.enter_context(postgres()) if in_postgres else None
+        stack.enter_context(server(scene.folder / "home", database))
+        workers = stack.enter_context(contextlib.ExitStack())
         from flows.automations import RESUME_CRON
 
         # Of ten seconds between two questions, five would be lost on each of these runs.
@@ -192,6 +194,8 @@ def run_pool(scene: Scene) -> int:
             _kill(record)
         pool.start_worker()
         wait_for(lambda: not pool.count(UNSETTLED), "the last run", LONGEST_S)
+        spans_s = list(pool.stage_spans_s(TINY_FILES.names))
+        (scene.folder / SPANS).write_text(json.dumps(spans_s))
         return scene.runs - pool.count(["COMPLETED"])
 
 
@@ -201,6 +205,7 @@ ROWS: dict[str, Callable[[Scene], int]] = {
     "dask": lambda scene: run_batch(scene, "dask"),
     "ray": lambda scene: run_batch(scene, "ray"),
     "pool": run_pool,
+    "postgres": lambda scene: run_pool(scene, in_postgres=True),
 }
 # A crashed run is given another try.
 UNSETTLED = ["SCHEDULED", "PENDING", "RUNNING", "PAUSED", "CANCELLING", "CRASHED"]
@@ -274,8 +279,8 @@ def _bury_orphans() -> None:
 
 def _spans_s(scene: Scene) -> Iterator[float]:
     """Of each whole run, from the start of the first stage to the end of the last, by the clock."""
-    if (bare := scene.folder / BARE_SPANS).exists():
-        yield from json.loads(bare.read_text())
+    if (told := scene.folder / SPANS).exists():
+        yield from json.loads(told.read_text())
         return
     (database,) = scene.folder.rglob("prefect.db")
     query = "SELECT flow_run_id, start_time, end_time FROM task_run WHERE name GLOB ?"
@@ -355,7 +360,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    there = [name for name in ROWS if name not in ("dask", "ray") or _has_runner(name)]
+    there = [name for name in ROWS if _can_run(name)]
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--rows", nargs="+", default=there, choices=there)
     parser.add_argument("--results", type=Path, help="JSON file to write")
@@ -390,8 +395,10 @@ def main() -> int:
     return int(any(cost.failed or cost.wrong for cost in costs.values()))
 
 
-def _has_runner(name: str) -> bool:
-    return importlib.util.find_spec(f"prefect_{name}") is not None
+def _can_run(name: str) -> bool:
+    if name == "postgres":
+        return has_postgres()
+    return name not in ("dask", "ray") or importlib.util.find_spec(f"prefect_{name}") is not None
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """A Prefect server, a process work pool with one worker, and runs of the tiny pipeline in it."""
 
 import contextlib
+import itertools
 import os
 import shutil
 import signal
@@ -8,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +23,7 @@ TINY = PROJECT / "tests" / "flows"
 sys.path[:0] = [str(PROJECT), str(TINY)]
 POOL, NAME = "svim3d", "pool"
 PATIENCE_S = 420.0
+PAGE = 200  # the most that the server tells at once
 SEED = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "svim3d"
 
 
@@ -30,11 +33,19 @@ def free_port() -> int:
 
 
 @contextlib.contextmanager
-def server(home: Path) -> Iterator[str]:
-    """A Prefect server with a data base of its own; its address."""
+def server(home: Path, database: str | None = None) -> Iterator[str]:
+    """A Prefect server with a data base of its own; its address.
+
+    Args:
+        home: where it keeps everything; not there yet.
+        database: address of an empty one; without it, SQLite under `home`.
+    """
     home.mkdir(parents=True)
-    for seed in SEED.glob("prefect-*.db"):  # migrated already: saves 20 s
-        shutil.copyfile(seed, home / "prefect.db")
+    if database is not None:
+        os.environ["PREFECT_API_DATABASE_CONNECTION_URL"] = database
+    else:
+        for seed in SEED.glob("prefect-*.db"):  # migrated already: saves 20 s
+            shutil.copyfile(seed, home / "prefect.db")
     port = free_port()
     url = f"http://127.0.0.1:{port}/api"
     os.environ.update(
@@ -159,6 +170,24 @@ class Pool:
             state=FlowRunFilterState(type=FlowRunFilterStateType(any_=list(states))),
         )
         return self.client.count_flow_runs(flow_run_filter=wanted)
+
+    def stage_spans_s(self, stages: Sequence[str]) -> Iterator[float]:
+        """Of each run that did all stages: from the first one's start to the last one's end."""
+        from prefect.client.schemas.sorting import TaskRunSort
+
+        moments = defaultdict(list)
+        page = {"sort": TaskRunSort.EXPECTED_START_TIME_DESC, "limit": PAGE}
+        for offset in itertools.count(0, PAGE):
+            found = self.client.read_task_runs(**page, offset=offset)
+            for run in found:
+                is_stage = any(run.name.startswith(f"{stage}-") for stage in stages)
+                if is_stage and run.start_time and run.end_time:
+                    moments[run.flow_run_id] += [run.start_time, run.end_time]
+            if len(found) < PAGE:
+                break
+        for times in moments.values():
+            if len(times) == 2 * len(stages):
+                yield (max(times) - min(times)).total_seconds()
 
 
 @dataclass
