@@ -23,6 +23,13 @@ from torch import Tensor
 from svim3d.cameras import Cameras
 from svim3d.numerics import dot, normalize, saturate
 from svim3d.synthesis.dice import Dice
+from svim3d.synthesis.displacements import (
+    nominal_px,
+    random_homography,
+    resample,
+    smooth_field,
+    source_points,
+)
 from svim3d.synthesis.view_defects import (
     MIN_COVERAGE,
     blurred,
@@ -31,13 +38,6 @@ from svim3d.synthesis.view_defects import (
     with_baked_light,
     with_moved_silhouette,
     with_tilted_normals,
-)
-from svim3d.synthesis.view_warps import (
-    nominal_px,
-    random_homography,
-    resample,
-    smooth_field,
-    source_points,
 )
 
 WORST = 5.0  # the largest severity

@@ -2,7 +2,7 @@
 
 Each function changes one thing by a strength of its own; a strength of zero is left to the caller,
 who then changes nothing. Colours are linear and straight (not premultiplied) unless told otherwise.
-A length in `px` is one of pixels of a picture 256 wide, as in `view_warps`.
+A length in `px` is one of pixels of a picture 256 wide, as in `displacements`.
 """
 
 import math
@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from svim3d.color import luminance
 from svim3d.numerics import dot, normalize, saturate
-from svim3d.synthesis.view_warps import nominal_px, pixel_centres, resample
+from svim3d.synthesis.displacements import nominal_px, pixel_centres, resample
 
 MIN_COVERAGE = 1e-3  # below it a pixel holds no colour that could be divided out
 MIN_LUMINANCE = 1e-6  # guards the ratio of two mean luminances where a view is black

@@ -4,17 +4,17 @@ import pytest
 import torch
 from sphere_orbit import sphere_cameras, sphere_images
 
+from svim3d.synthesis.displacements import (
+    largest_displacement_px,
+    pixel_centres,
+    resample,
+    transformed,
+)
 from svim3d.synthesis.inconsistency import (
     KINDS,
     WORST,
     Strengths,
     make_inconsistent,
-)
-from svim3d.synthesis.view_warps import (
-    largest_displacement_px,
-    pixel_centres,
-    resample,
-    transformed,
 )
 
 VIEWS, SIZE = 5, 64

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from svim3d.synthesis.dice import Dice
-from svim3d.synthesis.view_warps import (
+from svim3d.synthesis.displacements import (
     MIN_HALF_SIDE,
     homography_between,
     largest_displacement_px,
