@@ -15,9 +15,9 @@ from torch.nn import functional
 from svim3d.synthesis.dice import Dice
 
 NOMINAL_WIDTH = 256  # pixels of the picture that lengths are told for
-# Half side of the smallest box whose corners are moved, normalised. Corners of smaller boxes could
-# pass each other; eight pixels are an eighth of this one's side.
-MIN_HALF_SIDE = 0.25
+# Half side of the smallest box whose corners are moved. Corners of smaller boxes could pass each
+# other; eight pixels are an eighth of this one's side.
+MIN_HALF_PX = 32.0
 SHARED_MOTION = 0.6  # of each corner's displacement: the object is off as a whole, and distorted
 BOX_POINTS = 9  # along each side of the box, where displacements are looked at
 REACH_ROUNDS = 3  # brings the largest displacement within a per cent of what was drawn
@@ -41,10 +41,10 @@ def pixel_centres(shape: tuple[int, int], like: Tensor) -> Float[Tensor, "H W 2"
 
 
 def object_box(mask: Float[Tensor, "H W 1"]) -> Float[Tensor, "4 2"]:
-    """Normalised corners, in turn, of a box that holds what is covered.
+    """Normalised corners, in turn, of the square about the middle of what is covered that holds it.
 
-    A box narrower than `MIN_HALF_SIDE` allows is widened about its middle; an empty mask gives the
-    whole picture.
+    A square, because corners of a slender box that move as far bend the picture far more. It is no
+    smaller than `MIN_HALF_PX` allows; for an empty mask it is about the whole picture.
     """
     height, width, _ = mask.shape
     covered = mask[..., 0].cpu() > 0.5
@@ -55,7 +55,9 @@ def object_box(mask: Float[Tensor, "H W 1"]) -> Float[Tensor, "4 2"]:
         size = torch.tensor([width, height])
         low = 2.0 * torch.stack([column.min(), row.min()]) / size - 1.0
         high = 2.0 * torch.stack([column.max() + 1, row.max() + 1]) / size - 1.0
-    middle, half = 0.5 * (low + high), (0.5 * (high - low)).clamp_min(MIN_HALF_SIDE)
+    unit = nominal_px((height, width))
+    half = unit * (0.5 * (high - low) / unit).max().clamp_min(MIN_HALF_PX)
+    middle = 0.5 * (low + high)
     corners = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     return middle + corners * half
 

@@ -5,7 +5,7 @@ import torch
 
 from svim3d.synthesis.dice import Dice
 from svim3d.synthesis.displacements import (
-    MIN_HALF_SIDE,
+    MIN_HALF_PX,
     homography_between,
     largest_displacement_px,
     nominal_px,
@@ -25,13 +25,20 @@ def rectangle(size=64, rows=(20, 52), columns=(16, 40)):
     return mask
 
 
-def test_box_is_the_outer_edge_of_covered_pixels_and_never_too_small():
+def test_box_is_a_square_about_covered_pixels_and_never_too_small():
     box = object_box(rectangle())
-    assert torch.equal(box[0], torch.tensor([16 / 32 - 1, 20 / 32 - 1]))
-    assert torch.equal(box[2], torch.tensor([40 / 32 - 1, 52 / 32 - 1]))
+    # 24 columns from 16 on and 32 rows from 20 on: a square of 32 about column 28 and row 36.
+    assert torch.allclose(box[0], torch.tensor([12 / 32 - 1, 20 / 32 - 1]))
+    assert torch.allclose(box[2], torch.tensor([44 / 32 - 1, 52 / 32 - 1]))
     dot = object_box(rectangle(rows=(5, 6), columns=(60, 61)))
-    assert torch.allclose(dot[2] - dot[0], torch.full((2,), 2 * MIN_HALF_SIDE))
+    assert torch.allclose(dot[2] - dot[0], torch.full((2,), 4 * MIN_HALF_PX / 256))
     assert torch.equal(object_box(torch.zeros(8, 8, 1))[2], torch.ones(2))
+    # In a wide picture it is a square of pixels, not of shares of the picture.
+    wide = torch.zeros(64, 128, 1)
+    wide[10:50, 40:60] = 1.0
+    low, _, high, _ = object_box(wide)
+    sides = (high - low) * torch.tensor([128, 64]) / 2
+    assert torch.allclose(sides, torch.full((2,), 40.0))
 
 
 def test_homography_sends_corners_where_they_belong():
