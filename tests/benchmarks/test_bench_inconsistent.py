@@ -172,10 +172,10 @@ def test_means_weigh_orbits_alike_and_intervals_hold_them():
 
 def test_interval_of_many_orbits_is_that_of_their_mean():
     generator = torch.Generator().manual_seed(0)
-    values = torch.randn(200, generator=generator)
+    values = torch.randn(40, generator=generator)
     mean, interval = mean_and_interval({(str(i), 0): float(v) for i, v in enumerate(values)})
     assert mean == pytest.approx(float(values.mean()), abs=1e-6)
-    half = 1.96 * float(values.std()) / math.sqrt(200)
+    half = 1.96 * float(values.std()) / math.sqrt(40)
     assert interval[0] == pytest.approx(mean - half, abs=0.15 * half)
     assert interval[1] == pytest.approx(mean + half, abs=0.15 * half)
 
