@@ -7,18 +7,22 @@ cases share run once.
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import torch
-from evaluate_asset import evaluate
 
-from flows.config import PipelineConfig, load_config
-from flows.pipeline import IMAGE_TO_ASSET, SOURCE
-from flows.plan import Plan, Selection, Verdict, make_plan
-from stages.execution import run_stage
-from stages.store import Store, Stored
-from svim3d.io.exr import read_rgb
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from benchmarks.evaluate_asset import evaluate  # noqa: E402
+from flows.config import PipelineConfig, load_config  # noqa: E402
+from flows.pipeline import IMAGE_TO_ASSET, SOURCE  # noqa: E402
+from flows.plan import Plan, Selection, Verdict, make_plan  # noqa: E402
+from stages.execution import run_stage  # noqa: E402
+from stages.store import Store, Stored  # noqa: E402
+from svim3d.io.exr import read_rgb  # noqa: E402
 
 LAST_STAGE = "export"  # what the figures are about; the preview sheet is not counted
 
@@ -61,14 +65,14 @@ def run_case(plan: Plan, store: Store) -> dict[str, Stored]:
     return done
 
 
-def measure(plan: Plan, store: Store) -> dict[str, Any]:
-    """Seconds, memory and quality of one case."""
+def measure(plan: Plan, store: Store, truth: Path) -> dict[str, Any]:
+    """Seconds, memory and quality of one case; `truth` is the orbit that it is held against."""
     done = run_case(plan, store)
     records = {name: stored.manifest.record for name, stored in done.items()}
     phase0 = None
     if "env_preopt" in done:
         phase0 = torch.from_numpy(read_rgb(done["env_preopt"].folder / "environment.exr"))
-    figures = evaluate(done[LAST_STAGE].folder / "asset.glb", plan.source, phase0)
+    figures = evaluate(done[LAST_STAGE].folder / "asset.glb", truth, phase0)
     return {
         "key": case_key(plan),
         "seconds": {name: record["seconds"] for name, record in records.items()},
@@ -93,7 +97,7 @@ def main() -> None:
     plan = plan_case(
         given.orbit, given.preset, given.overrides, given.skip, store=store, seed=given.seed
     )
-    result = measure(plan, store)
+    result = measure(plan, store, given.orbit)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_text(json.dumps(result, indent=1))
 

@@ -9,6 +9,9 @@ Source: SViM3D, section 4 ("illumination optimisation"). Differs from the paper:
 the lobes' exact integrals, and the loss compares square roots of radiance by absolute difference:
 that gives each decade of brightness its say and leaves shadowed and doubly reflected pixels, which
 the model cannot explain, as outliers.
+
+`light=spherical_gaussians` fits 24 white lobes instead of a map's texels and writes their map: the
+paper's ablation "without environment lighting" (its light is SV3D's).
 """
 
 import math
@@ -24,6 +27,7 @@ from stages.prefilter_cache import cached_operator
 from stages.settings.env_preopt import EnvPreoptConfig
 from svim3d.numerics import dot, normalize
 from svim3d.shading.octahedral import total_variation
+from svim3d.shading.spherical_gaussians import LOBES, lobes_over_sphere, log_octahedral
 from svim3d.shading.stored_shading import StoredShading
 
 BLACK_LEVEL = 0.02  # of the mean radiance: below it the square root no longer magnifies noise
@@ -50,12 +54,13 @@ def run(views: MaterialViews, *, config: EnvPreoptConfig, ctx: Context) -> Envir
     # A white environment tells how bright the materials are; their ratio starts the fit.
     white = torch.ones(config.size, config.size, 3, device=ctx.device)
     start = radiance.sum(0) / shading(operator(white)).sum(0).clamp_min(MIN_RADIANCE)
-    log_radiance = (white * start.clamp_min(MIN_RADIANCE)).log().requires_grad_()
+    light = _start_light(start.clamp_min(MIN_RADIANCE), config)
     objective = _Objective(radiance, trust)
-    optimizer = torch.optim.Adam([log_radiance], lr=config.learning_rate, betas=ADAM_BETAS)
-    for step in range(_resume(ctx, log_radiance, optimizer), config.steps):
+    optimizer = torch.optim.Adam([light], lr=config.learning_rate, betas=ADAM_BETAS)
+    for step in range(_resume(ctx, light, optimizer), config.steps):
         if ctx.checkpoints.due():
-            _checkpoint(ctx, step, log_radiance, optimizer)
+            _checkpoint(ctx, step, light, optimizer)
+        log_radiance = _log_radiance(light, config)
         terms = {
             "photometric": objective(shading(operator(log_radiance.exp()))),
             "smooth": config.smooth_weight * total_variation(log_radiance),
@@ -69,7 +74,19 @@ def run(views: MaterialViews, *, config: EnvPreoptConfig, ctx: Context) -> Envir
         rate = config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
         optimizer.param_groups[0]["lr"] = rate
         optimizer.step()
-    return EnvironmentLight(log_radiance.detach().exp().cpu())
+    return EnvironmentLight(_log_radiance(light, config).detach().exp().cpu())
+
+
+def _start_light(radiance: Float[Tensor, "3"], config: EnvPreoptConfig) -> Float[Tensor, "..."]:
+    """What is optimised, for an even light: log radiance of all texels, or a row for each lobe."""
+    if config.light == "spherical_gaussians":
+        return lobes_over_sphere(LOBES, radiance.mean()).requires_grad_()
+    return radiance.log().repeat(config.size, config.size, 1).requires_grad_()
+
+
+def _log_radiance(light: Float[Tensor, "..."], config: EnvPreoptConfig) -> Float[Tensor, "n n 3"]:
+    """The map that the light is."""
+    return log_octahedral(light, config.size) if light.ndim == 2 else light
 
 
 class _Objective:
@@ -146,7 +163,7 @@ def _usable_pixels(
 def _checkpoint(ctx: Context, step: int, x: Tensor, optimizer: torch.optim.Adam) -> None:
     """Keep everything that the steps from `step` on depend on."""
     moments = {f"adam.{name}": value for name, value in optimizer.state[x].items()}
-    ctx.checkpoints.save(step, {"log_radiance": x, **moments})
+    ctx.checkpoints.save(step, {"light": x, **moments})
 
 
 def _resume(ctx: Context, x: Tensor, optimizer: torch.optim.Adam) -> int:
@@ -156,7 +173,7 @@ def _resume(ctx: Context, x: Tensor, optimizer: torch.optim.Adam) -> int:
         return 0
     step, state = saved
     with torch.no_grad():
-        x.copy_(state.pop("log_radiance"))
+        x.copy_(state.pop("light"))
     optimizer.state[x] = {
         name.removeprefix("adam."): value if name == "adam.step" else value.to(x.device)
         for name, value in state.items()

@@ -12,6 +12,9 @@ class EnvPreoptConfig(StageConfig):
 
     size: Literal[16, 32, 64, 128, 256] = 128
     """Side of the octahedral environment map, texels (SViM3D optimises at low resolution)."""
+    light: Literal["map", "spherical_gaussians"] = "map"
+    """`map`: every texel is free; `spherical_gaussians`: 24 white lobes, a baseline. To keep it in
+    later phases set their `environment_rate` to 0."""
     prefilter: Literal["exact", "hybrid", "sampled"] = "exact"
     """How the pyramid is filtered: the lobes' own integrals, these with samples where lobes are
     narrow, or the paper's few samples."""

@@ -131,9 +131,10 @@ def test_light_counts_each_pixel_by_its_confidence(make_context):
     assert not torch.equal(light(halved), light(views))
 
 
-def test_resumed_run_ends_with_the_same_bytes(make_context):
+@pytest.mark.parametrize("light", ["map", "spherical_gaussians"])
+def test_resumed_run_ends_with_the_same_bytes(make_context, light):
     views = sphere_views(smooth_environment(), roughness=0.3)
-    config = TINY.model_copy(update={"steps": 12})
+    config = TINY.model_copy(update={"steps": 12, "light": light})
     whole = ENV_PREOPT.run(views, config=config, ctx=make_context("env_preopt"))
 
     class Killed(Exception):
@@ -157,6 +158,26 @@ def test_resumed_run_ends_with_the_same_bytes(make_context):
     assert saved[0] == 6
     resumed = ENV_PREOPT.run(views, config=config, ctx=resumed_context)
     assert torch.equal(resumed.radiance, whole.radiance)
+
+
+LOBED = TINY.model_copy(update={"light": "spherical_gaussians"})
+
+
+def test_spherical_gaussians_find_a_white_lamp(make_context):
+    truth = smooth_environment().mean(-1, keepdim=True).repeat(1, 1, 3)
+    views = sphere_views(truth, roughness=0.2)
+    light = ENV_PREOPT.run(views, config=LOBED, ctx=make_context("env_preopt")).radiance
+    flat = truth.mean((0, 1)).expand_as(truth)
+    assert blurred_error(flat, truth) > 0.5
+    assert blurred_error(light, truth) < 0.15
+    # The lamp is where it was.
+    assert int(light[..., 0].argmax()) == int(truth[..., 0].argmax())
+
+
+def test_spherical_gaussians_stay_white_under_a_coloured_light(make_context):
+    views = sphere_views(smooth_environment(), roughness=0.2)
+    light = ENV_PREOPT.run(views, config=LOBED, ctx=make_context("env_preopt")).radiance
+    assert torch.equal(light, light[..., :1].expand(-1, -1, 3))
 
 
 def test_views_without_a_usable_pixel_are_refused(make_context):
