@@ -139,9 +139,9 @@ def obj_files(
     faces: Int[Tensor, "F 3"],
     normals: Float[Tensor, "N 3"],
     basecolor: Float[Tensor, "*texels 3"],
-    orm: Float[Tensor, "*texels 3"],
+    orm: Float[Tensor, "*orm_texels 3"],
     uv: Float[Tensor, "N 2"] | None = None,
-    normal_tangent: Float[Tensor, "T T 3"] | None = None,
+    normal_tangent: Float[Tensor, "M M 3"] | None = None,
     orm_factor: Float[Tensor, "3"] | None = None,
     name: str = "asset",
 ) -> dict[str, bytes]:

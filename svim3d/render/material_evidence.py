@@ -96,16 +96,22 @@ class Verdict:
 
     @property
     def lost_db(self) -> float:
-        """By how much the full texture is closer to held-out pixels; negative where it is not."""
+        """By how much the full texture is closer to held-out pixels; negative where it is not.
+
+        What is beyond `FLOOR_DB` does not count.
+        """
         texture = next(h for h in (self.chosen, *self.rejected) if h.form == "texture")
-        return texture.error_db - self.chosen.error_db
+        return min(texture.error_db, FLOOR_DB) - min(self.chosen.error_db, FLOOR_DB)
 
     def __str__(self) -> str:
         told = ", ".join(
             f"{_named(h)} {h.error_db:.1f} dB, cost {h.cost:.0f}"
             for h in sorted((self.chosen, *self.rejected), key=lambda h: h.clusters or 99)
         )
-        return f"{_named(self.chosen)} of {self.independent:.0f} independent pixels ({told})"
+        return (
+            f"{_named(self.chosen)} by {self.independent:.0f} independent pixels, "
+            f"{max(self.lost_db, 0.0):.1f} dB lost against the texture ({told})"
+        )
 
 
 def _named(hypothesis: Hypothesis) -> str:

@@ -275,5 +275,5 @@ class _Maker:
             for name, error in errors.items()
         )
         form = "the mesh's own" if is_flat else "texture"
-        notes[NORMAL] = f"{form} of {count:.0f} independent pixels ({told})"
+        notes[NORMAL] = f"{form} by {count:.0f} independent pixels ({told})"
         return is_flat

@@ -36,9 +36,10 @@ def growing_palettes(
 
     Args:
         texels: values to be told apart.
-        mass: what each counts.
+        mass: what each counts; those of none are left out.
         largest: number of clusters of the last one.
     """
+    texels, mass = texels[mass > 0], mass[mass > 0]
     palette = Palette(((mass[:, None] * texels).sum(0) / mass.sum().clamp_min(MIN_SHARE))[None])
     while len(palette.values) < largest:
         labels = palette.labels(texels)

@@ -51,9 +51,9 @@ class ViewPixels:
         fine = self.operator.forward_matrix.scipy()
         row, column = fine.indices // self.texture_size, fine.indices % self.texture_size
         block = row // factor * size + column // factor
-        matrix = scipy.sparse.csr_matrix(
-            (fine.data, block, fine.indptr.copy()), (fine.shape[0], size**2)
-        )
+        # Copies: entries are summed in place.
+        entries = fine.data.copy(), block, fine.indptr.copy()
+        matrix = scipy.sparse.csr_matrix(entries, (fine.shape[0], size**2))
         matrix.sum_duplicates()
         return replace(self, operator=SparseOperator(matrix), texture_size=size)
 
