@@ -11,6 +11,7 @@ of textures, smaller textures. What was chosen, and the figures behind it, are t
 """
 
 from dataclasses import replace
+from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -87,13 +88,14 @@ def run(
         sized=config.texture_sizes == "evidence",
         prior=config.fit_prior,
         iterations=max(config.fit_iterations, JUDGED_ITERATIONS),
+        sharpened=config.fit_iterations,
     )
-    pixels = None
-    if config.fit_iterations or wanted.nested or wanted.sized:
-        pixels = _seen(mesh, texels.size, views)
-    if config.fit_iterations and pixels is not None:
-        values = torch.cat([_sharpened(values[:, :5], texels, pixels, config), values[:, 5:]], 1)
-    maps = material_maps(_baked_texels(mesh, values, texels), pixels, views.normal_world, wanted)
+    pixels_at = cache(lambda size: _seen(mesh, size, views))
+    if config.fit_iterations:
+        fit = _sharpened(values[:, :5], texels, pixels_at(texels.size), config)
+        values = torch.cat([fit, values[:, 5:]], 1)
+    baked = _baked_texels(mesh, values, texels)
+    maps = material_maps(baked, pixels_at, views.normal_world, wanted)
     for name, note in maps.notes.items():
         ctx.event("material", f"{name}: {note}", tell=False)
     ctx.report(4, 4, {"coverage": len(texels.pixel) / texels.size**2})

@@ -26,13 +26,12 @@ from torch import Tensor
 from svim3d.color import srgb_from_linear
 from svim3d.render.palettes import border_length, growing_palettes, have_insides, palette_values
 from svim3d.render.texture_fit import fit_texels
-from svim3d.render.view_pixels import ViewPixels
+from svim3d.render.view_pixels import FLOOR_DB, ViewPixels
 
 Form = Literal["constant", "palette", "texture"]
 Curve = Callable[[Tensor], Tensor]
 
 LARGEST_PALETTE = 4  # clusters; more seldom pay, and a file of so many is a texture's size
-FLOOR_DB = 45.0  # of a peak of 1: what is closer than 1.4 steps of 8 bits is not told apart
 KNOWN = 0.99  # share of a pixel whose texels the other half of the views has seen
 MIN_PIXELS = 64  # held-out pixels below which nothing can be said
 

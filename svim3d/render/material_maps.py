@@ -1,6 +1,7 @@
 """From baked texels to the maps of an asset: all as textures, or each in the form that it needs."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -8,11 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from svim3d.color import srgb_from_linear
-from svim3d.mesh.texels import Texels, average_down, to_image
+from svim3d.mesh.texels import Texels, average_down, fill_empty, to_image
 from svim3d.numerics import normalize
 from svim3d.render.material_evidence import (
     BASECOLOR,
-    FLOOR_DB,
     GROUPS,
     METALLIC,
     ROUGHNESS,
@@ -22,12 +22,15 @@ from svim3d.render.material_evidence import (
     judge,
 )
 from svim3d.render.palettes import growing_palettes, palette_values
+from svim3d.render.texture_fit import fit_texels
 from svim3d.render.texture_size import size_for_pixels, sufficient_texels
-from svim3d.render.view_pixels import ViewPixels
+from svim3d.render.view_pixels import FLOOR_RMS, ViewPixels
 
 NORMAL, OCCLUSION = "normal", "occlusion"
-NORMAL_FLOOR_RAD = math.radians(1.0)  # normals closer than this are not told apart
-NO_OCCLUSION = 10.0 ** (-FLOOR_DB / 20.0)  # RMS share of hidden sky that nobody sees
+# RMS angle below which normals are not told apart: decimation may turn them by 1 degree on average,
+# which is 1.13 to 1.3 degrees RMS.
+NORMAL_FLOOR_RAD = math.radians(1.25)
+NO_OCCLUSION = FLOOR_RMS  # RMS share of hidden sky that nobody sees
 
 
 @dataclass(frozen=True)
@@ -79,33 +82,34 @@ class Wanted:
         sized: choose each texture's size, else all have that of the texels.
         prior: of the textures' fit that the views' halves are compared by, see `fit_texels`.
         iterations: of that fit.
+        sharpened: steps of the fit of a texture whose size has changed; 0: none.
     """
 
     nested: bool
     sized: bool
     prior: float
     iterations: int
+    sharpened: int
 
 
 def material_maps(
     baked: BakedTexels,
-    pixels: ViewPixels | None,
-    normals: Float[Tensor, "V H W 3"] | None,
+    pixels_at: Callable[[int], ViewPixels],
+    normals: Float[Tensor, "V H W 3"],
     wanted: Wanted,
 ) -> MaterialMaps:
     """All maps of an asset.
 
     Args:
         baked: the finished texels.
-        pixels: what the views say of basecolor, roughness and metallic; may be left out where
-            nothing is chosen.
+        pixels_at: what the views say of basecolor, roughness and metallic, in terms of the texels
+            of a texture of a given size.
         normals: what they say of normals, world frame.
         wanted: which choices are made.
     """
-    if pixels is None or normals is None or not (wanted.nested or wanted.sized):
+    if not (wanted.nested or wanted.sized):
         return _as_baked(baked)
-    maker = _Maker(baked, pixels, normals, wanted)
-    return maker.maps()
+    return _Maker(baked, pixels_at, normals, wanted).maps()
 
 
 def _as_baked(baked: BakedTexels) -> MaterialMaps:
@@ -128,12 +132,14 @@ class _Maker:
     def __init__(
         self,
         baked: BakedTexels,
-        pixels: ViewPixels,
+        pixels_at: Callable[[int], ViewPixels],
         normals: Float[Tensor, "V H W 3"],
         wanted: Wanted,
     ) -> None:
-        self._baked, self._pixels, self._normals, self._wanted = baked, pixels, normals, wanted
         size = baked.texels.size
+        pixels = pixels_at(size)
+        self._baked, self._pixels, self._normals, self._wanted = baked, pixels, normals, wanted
+        self._pixels_at = pixels_at
         distinct, seen = pixels.distinct()
         self._enough = size_for_pixels(distinct, seen, size)
         self._seen_share = seen / size**2
@@ -228,10 +234,26 @@ class _Maker:
     def _image(self, group: Channels, verdict: Verdict | None, size: int) -> Float[Tensor, "S S c"]:
         """A picture of all texels' values, or of a palette's."""
         image = self._averaged(self._baked.surface[:, group.places], size)
-        if verdict is None or verdict.chosen.form != "palette":
-            return image
-        pixels = self._pixels.coarsened(self._baked.texels.size // size)
         flat = image.reshape(size * size, -1)
+        pixels = self._pixels_at(size).of(group.places)
+        if verdict is None or verdict.chosen.form != "palette":
+            if size == self._baked.texels.size or not self._wanted.sharpened:
+                return image
+            # Averaged texels, read bilinearly, blur: the views are asked for sharper ones again.
+            fitted = fit_texels(
+                pixels.operator,
+                pixels.target,
+                pixels.weight,
+                flat,
+                prior=self._wanted.prior,
+                iterations=self._wanted.sharpened,
+            )
+            shown = torch.zeros(size * size, dtype=torch.bool)
+            texels = self._baked.texels
+            row, column = texels.pixel // texels.size, texels.pixel % texels.size
+            factor = texels.size // size
+            shown[row // factor * size + column // factor] = True
+            return fill_empty(fitted.view(size, size, -1), shown.view(size, size))
         seen = group.curve(flat.clamp(0.0, 1.0))
         palette, mass = None, pixels.mass()
         for grown in growing_palettes(seen, mass, verdict.chosen.clusters):
@@ -239,7 +261,7 @@ class _Maker:
         if palette is None:  # at this size the texels are all alike
             return image
         labels, clusters = palette.labels(seen), len(palette.values)
-        values = palette_values(labels, clusters, flat, mass, pixels.of(group.places))
+        values = palette_values(labels, clusters, flat, mass, pixels)
         return values[labels].view(size, size, -1)
 
     def _averaged(self, values: Float[Tensor, "P C"], size: int) -> Float[Tensor, "S S C"]:
@@ -269,7 +291,9 @@ class _Maker:
             name: cost(error, count, free[name], NORMAL_FLOOR_RAD**2)
             for name, error in errors.items()
         }
-        is_flat = costs["mesh"] <= costs["map"]
+        # Whatever it costs, a map stays that turns what is seen by more than may go unnoticed.
+        turned = math.sqrt(max(errors["mesh"] - errors["map"], 0.0))
+        is_flat = costs["mesh"] <= costs["map"] and turned <= NORMAL_FLOOR_RAD
         told = ", ".join(
             f"{name} {math.degrees(math.sqrt(error)):.2f} deg, cost {costs[name]:.0f}"
             for name, error in errors.items()

@@ -14,7 +14,11 @@ from torch import Tensor
 
 from svim3d.shading.linear_operator import SparseOperator
 
-MAX_LAG_PX = 16  # pixels farther apart count as independent
+FLOOR_DB = 45.0  # of a peak of 1: what is closer than 1.4 steps of 8 bits is not told apart
+FLOOR_RMS = 10.0 ** (-FLOOR_DB / 20.0)
+OUTLIER = 3.0 * 1.4826  # times the median magnitude: three standard deviations of Gaussian noise
+# Of the picture's side. What errs alike over more is no noise but another material.
+MAX_LAG = 1 / 8
 MIN_CORRELATION = 0.05  # lags from the first below it on are left out: they would add up noise
 
 
@@ -111,12 +115,19 @@ class ViewPixels:
         return equal / self._correlation_area(residual)
 
     def _correlation_area(self, residual: Float[Tensor, "P C"]) -> float:
-        """Integral of the residuals' autocorrelation in pixels, as a product of two axes."""
+        """Integral of the residuals' autocorrelation in pixels, as a product of two axes.
+
+        Large residuals are cut: those along an edge that a texture cannot draw would pass for
+        noise that is smooth along the edge. What is below the floor counts as noise without any.
+        """
         views, height, width = self.shape
         image = residual.new_zeros(views * height * width, residual.shape[1])
         known = residual.new_zeros(views * height * width, 1)
-        image[self.pixel] = residual * (self.weight > 0)
-        known[self.pixel] = (self.weight > 0).to(residual)
+        trusted = self.weight[:, 0] > 0
+        spread = residual[trusted].abs().median() if bool(trusted.any()) else residual.new_zeros(())
+        limit = OUTLIER * float(spread) + FLOOR_RMS
+        image[self.pixel] = residual.clamp(-limit, limit) * trusted[:, None]
+        known[self.pixel] = trusted[:, None].to(residual)
         image, known = image.view(*self.shape, -1), known.view(*self.shape, 1)
         return math.prod(_correlation_length(image, known, axis) for axis in (1, 2))
 
@@ -126,14 +137,15 @@ def _correlation_length(
 ) -> float:
     """1 + 2 sum of the correlations at growing lags along an axis, until they have died away."""
     length = 1.0
-    for lag in range(1, min(MAX_LAG_PX, image.shape[axis] - 1) + 1):
+    for lag in range(1, round(MAX_LAG * image.shape[axis]) + 1):
         here, there = (
             (t.narrow(axis, 0, t.shape[axis] - lag), t.narrow(axis, lag, t.shape[axis] - lag))
             for t in (image, known)
         )
         both = there[0] * there[1]
         product = float((here[0] * here[1] * both).double().sum())
-        energies = [float((h.square() * both).double().sum()) for h in here]
+        floor = FLOOR_RMS**2 * float(both.sum()) * image.shape[-1]
+        energies = [float((h.square() * both).double().sum()) + floor for h in here]
         energy = math.sqrt(energies[0] * energies[1])
         correlation = product / energy if energy > 0.0 else 0.0
         if correlation < MIN_CORRELATION:

@@ -50,7 +50,7 @@ NEEDED = FIXED.model_copy(
 SMALL = 100_000  # bytes
 LEVEL = 1.0 / 255.0
 NOISE = {"noise": 0.03, "blur_px": 1.5}
-VIEWS = {"views": 6, "size": 48}
+VIEWS = {"views": 8, "size": 64}
 
 
 class Made:
@@ -104,6 +104,11 @@ def two(tmp_path_factory):
 @pytest.fixture(scope="module")
 def pattern(tmp_path_factory):
     return Made(tmp_path_factory.mktemp("pattern"), with_a_pattern, NEEDED)
+
+
+@pytest.fixture(scope="module")
+def pattern_as_textures(tmp_path_factory):
+    return Made(tmp_path_factory.mktemp("patterned"), with_a_pattern, FIXED)
 
 
 def picture(mesh_file):
@@ -184,11 +189,13 @@ def test_two_materials_are_a_palette_of_two(two):
     assert len(two.glb) < SMALL
 
 
-def test_a_pattern_stays_a_texture(pattern):
+def test_a_pattern_stays_a_texture(pattern, pattern_as_textures):
     for name in ("basecolor", "roughness", "metallic"):
         assert pattern.asset.summary[f"{name}_map"].startswith("texture of")
-    figures = previewed(pattern)
-    assert figures["basecolor_psnr_db"] > 25.0  # as one colour: 17.1 dB
+    needed, textured = previewed(pattern), previewed(pattern_as_textures)
+    for name in ("basecolor", "roughness", "metallic", "radiance"):
+        assert needed[f"{name}_psnr_db"] > textured[f"{name}_psnr_db"] - 0.2
+    assert len(pattern.glb) < 0.5 * len(pattern_as_textures.glb)
 
 
 def previewed(made):
@@ -201,7 +208,7 @@ def previewed(made):
 
 def test_preview_relight_and_edit_read_an_asset_without_textures(one, tmp_path):
     figures = previewed(one)
-    assert figures["mask_iou"] > 0.97
+    assert figures["mask_iou"] > 0.94  # of pixels that are more than half covered
     assert figures["roughness_psnr_db"] > 28.0  # the views' noise of 0.03 is 30.5 dB
     context = Context("relight", torch.device("cpu"), 0, tmp_path / "work", tmp_path)
     still = RelightConfig(size=32, orbit_views=2, supersample=1, turntable="none")
@@ -261,7 +268,7 @@ def test_a_knurled_object_keeps_more_faces(one):
     surface = replace(grey_sphere(48), sdf=RADIUS + knobs - radius).own_surface()
     views = sphere_views(of_one_material, **VIEWS)
     shown = uv_bake.ShapePictures.of_surface(surface.vertices, surface.faces, views.cameras)
-    seen = replace(views, mask=shown.covered.float(), normal_world=normalize(shown.normals))
+    seen = replace(views, mask=shown.covered, normal_world=normalize(shown.normals))
     context = one._context(one.file.parent, "knurled")
     fine = uv_bake.CleanMesh(surface.vertices, surface.faces)
     kept = uv_bake._decimated(fine, seen, NEEDED, context)
