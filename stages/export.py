@@ -97,7 +97,7 @@ def _glb(mesh: TexturedMesh) -> bytes:
 
 
 def _coarser(mesh: TexturedMesh, levels: int) -> Iterator[tuple[TexturedMesh, ShapeError]]:
-    """Levels of detail of growing error, each decimated from the mesh before it."""
+    """Levels of detail of growing error, each decimated from the mesh before it to fewer faces."""
     radius = fitting_radius(mesh.vertices, FOV_Y_DEG, FILL)
     angles = orbit_angles(LOD_VIEWS, 0.0, LOD_SWING_DEG)
     cameras = orbit_cameras(angles, radius=radius, fov_y_deg=FOV_Y_DEG, size=LOD_PICTURE_PX)
@@ -109,6 +109,8 @@ def _coarser(mesh: TexturedMesh, levels: int) -> Iterator[tuple[TexturedMesh, Sh
         found = decimate_to_error(
             last.vertices, last.faces, pictures, limit=limit, max_faces=len(last.faces)
         )
+        if len(found.mesh.faces) >= len(last.faces):
+            continue  # decimation has come to its end, or the limit asks for all of them
         last = found.mesh
         error = pictures.error(last.vertices, last.faces)
         yield transferred(mesh, last.vertices, last.faces), error

@@ -24,7 +24,7 @@ class ExportConfig(StageConfig):
         default=0,
         ge=0,
         le=3,
-        description="coarser levels of detail written beside the GLB, as asset_lod1.glb, ...",
+        description="coarser levels of detail at most, written beside it as asset_lod1.glb, ...",
     )
 
     @field_validator("formats")
