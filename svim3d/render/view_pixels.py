@@ -93,12 +93,13 @@ class ViewPixels:
             The number of pixels, and how many texels they see.
         """
         matrix = self.operator.forward_matrix.scipy()
-        trusted = scipy.sparse.diags_array((self.weight[:, 0] > 0).numpy().astype(np.float32))
+        trusted = (self.weight[:, 0] > 0).numpy()
         view = self.view.numpy()
         largest = np.zeros(matrix.shape[1], np.float32)
         for index in np.unique(view):
-            rows = trusted @ matrix
-            largest = np.maximum(largest, np.asarray(rows[view == index].sum(0)).reshape(-1))
+            rows = matrix[trusted & (view == index)]
+            seen = np.bincount(rows.indices, rows.data, matrix.shape[1]).astype(np.float32)
+            np.maximum(largest, seen, out=largest)
         return float(largest.sum()), int((largest > 0).sum())
 
     def independent(self, residual: Float[Tensor, "P C"]) -> float:
