@@ -21,6 +21,7 @@ from svim3d.io.orbit import read_orbit, write_orbit
 from svim3d.io.orbit_sheet import orbit_sheet
 from svim3d.io.weights import load_tensors, save_tensors
 from svim3d.mesh.marching import extract_surface
+from svim3d.mesh.painted_mesh import PaintedMesh
 from svim3d.numerics import normalize
 from svim3d.shading.environment import latlong_from_octahedral
 
@@ -243,65 +244,52 @@ class RefinedSurface:
 
 
 @dataclass(frozen=True)
-class TexturedMesh:
-    """A mesh ready for export, textured (phase 3) or coloured per vertex (phase 3 skipped).
-
-    A vertex appears once per texture coordinate, as in glTF. Textures have row 0 at the top and
-    `uv` has its origin at the top left, as in glTF.
-
-    Attributes:
-        vertices: world positions.
-        faces: counter-clockwise seen from outside.
-        normals: unit, per vertex.
-        uv: texture coordinates in [0, 1], or None when coloured per vertex.
-        tangents: unit tangent and handedness (+1 or -1), MikkTSpace-compatible, or None.
-        basecolor: linear, in [0, 1]: a texture [T, T, 3] or per vertex [N, 3].
-        orm: occlusion, roughness, metallic in [0, 1], same layout.
-        normal_tangent: texture of unit tangent-space normals, green up, or None.
-    """
-
-    vertices: Float[Tensor, "N 3"]
-    faces: Int[Tensor, "F 3"]
-    normals: Float[Tensor, "N 3"]
-    uv: Float[Tensor, "N 2"] | None
-    tangents: Float[Tensor, "N 4"] | None
-    basecolor: Float[Tensor, "*texels 3"]
-    orm: Float[Tensor, "*texels 3"]
-    normal_tangent: Float[Tensor, "T T 3"] | None
+class TexturedMesh(PaintedMesh):
+    """Phase 3's result, or what stands in for it: a mesh ready for export."""
 
     def save(self, folder: Path) -> None:
-        """Write geometry as safetensors and textures as PNG (basecolor sRGB, 8 bit)."""
-        geometry = {"vertices": self.vertices, "faces": self.faces, "normals": self.normals}
-        if self.uv is not None and self.tangents is not None and self.normal_tangent is not None:
-            geometry |= {"uv": self.uv, "tangents": self.tangents}
-            write_png(folder / "basecolor.png", self.basecolor, srgb=True)
-            write_png(folder / "orm.png", self.orm)
+        """Write textures as PNG (basecolor sRGB, 8 bit) and all else as safetensors."""
+        tensors = {"vertices": self.vertices, "faces": self.faces, "normals": self.normals}
+        for name in ("uv", "tangents", "orm_factor"):
+            if getattr(self, name) is not None:
+                tensors[name] = getattr(self, name)
+        for name, values in (("basecolor", self.basecolor), ("orm", self.orm)):
+            if values.ndim == 3:
+                write_png(folder / f"{name}.png", values, srgb=name == "basecolor")
+            else:
+                tensors[name] = values
+        if self.normal_tangent is not None:
             write_png(folder / "normal.png", self.normal_tangent * 0.5 + 0.5)
-        else:
-            geometry |= {"basecolor": self.basecolor, "orm": self.orm}
-        save_tensors(folder / "mesh.safetensors", geometry)
+        save_tensors(folder / "mesh.safetensors", tensors)
 
     @classmethod
     def load(cls, folder: Path) -> Self:
-        """Read geometry and, where there are any, textures."""
-        geometry = load_tensors(folder / "mesh.safetensors")
-        textured = "uv" in geometry
+        """Read what `save` wrote."""
+        tensors = load_tensors(folder / "mesh.safetensors")
+        for name in ("basecolor", "orm"):
+            if name not in tensors:
+                tensors[name] = read_png(folder / f"{name}.png", srgb=name == "basecolor")
+        normal = None
+        if (folder / "normal.png").is_file():
+            normal = read_png(folder / "normal.png") * 2.0 - 1.0
         return cls(
-            vertices=geometry["vertices"],
-            faces=geometry["faces"],
-            normals=geometry["normals"],
-            uv=geometry.get("uv"),
-            tangents=geometry.get("tangents"),
-            basecolor=(
-                read_png(folder / "basecolor.png", srgb=True) if textured else geometry["basecolor"]
-            ),
-            orm=read_png(folder / "orm.png") if textured else geometry["orm"],
-            normal_tangent=read_png(folder / "normal.png") * 2.0 - 1.0 if textured else None,
+            vertices=tensors["vertices"],
+            faces=tensors["faces"],
+            normals=tensors["normals"],
+            uv=tensors.get("uv"),
+            tangents=tensors.get("tangents"),
+            basecolor=tensors["basecolor"],
+            orm=tensors["orm"],
+            normal_tangent=normal,
+            orm_factor=tensors.get("orm_factor"),
         )
 
     def headline(self) -> str:
         """Number of triangles and what carries the materials."""
-        paint = "coloured per vertex" if self.uv is None else f"{len(self.basecolor)} px textures"
+        sizes = [len(image) for image in self.textures.values()]
+        paint = f"{max(sizes)} px textures" if sizes else "one material"
+        if self.basecolor.ndim == 2:
+            paint = "coloured per vertex"
         return f"{len(self.faces)} faces, {paint}"
 
 

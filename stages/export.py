@@ -1,10 +1,14 @@
 """Textured mesh to finished files: GLB, on request OBJ, and the environment that belongs to it.
 
 Reads the textured mesh or, when phase 3 was skipped, colours the surface per vertex; writes
-`asset.glb` and `environment.exr`. The GLB is opened again by another reader (trimesh) and compared.
+`asset.glb` and `environment.exr`, on request coarser levels of detail. Each GLB is opened again by
+another reader (trimesh) and compared.
 """
 
+from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,14 +17,18 @@ from stages.artifacts import ExportedAsset, FittedField, RefinedSurface, Texture
 from stages.base import Context, Stage
 from stages.errors import InputError
 from stages.settings.export import ExportConfig
+from svim3d.cameras import fitting_radius, orbit_angles, orbit_cameras
 from svim3d.color import srgb_from_linear
 from svim3d.io.exr import write_rgb
 from svim3d.io.glb import glb_bytes, reopen_glb
 from svim3d.io.obj import obj_files
-from svim3d.mesh.cleanup import clean_surface, decimate, is_closed
+from svim3d.mesh.cleanup import CleanMesh, clean_surface, decimate, is_closed
 from svim3d.mesh.mesh import signed_volume, vertex_normals
 from svim3d.mesh.texels import rasterize_uv
 from svim3d.numerics import normalize
+from svim3d.render.face_budget import COARSER, ShapeError, ShapePictures, decimate_to_error
+from svim3d.render.material_evidence import LARGEST_PALETTE
+from svim3d.render.texture_transfer import transferred
 from svim3d.shading.environment import latlong_from_octahedral
 
 NAME = "asset"
@@ -28,6 +36,9 @@ ENVIRONMENT_HEIGHT = 128  # rows of the lat-long picture; an octahedral map of 1
 MIN_AREA_SHARE, MIN_EXTENT_SHARE = 0.002, 0.05  # of floaters, the defaults of uv_bake
 POINTS_PER_CHUNK = 2**17  # bounds the memory of the field's intermediate values
 POSITION_TOLERANCE = 1e-6  # world units; the file holds the same 32-bit floats
+# Cameras that levels of detail are held against: the views that the asset came of are not at hand.
+LOD_VIEWS, LOD_SWING_DEG, LOD_PICTURE_PX = 8, 30.0, 256
+FOV_Y_DEG, FILL = 33.8, 0.85
 TEXTURE_TOLERANCE = 1.01 / 255.0  # one step of 8 bits and its rounding
 
 
@@ -50,33 +61,59 @@ def run(
         mesh = _colored(surface if surface is not None else field.own_surface(), config, ctx)
     if not len(mesh.faces):
         raise InputError("wanted a mesh to export, got one without faces; run uv_bake again")
-    content = glb_bytes(
-        vertices=mesh.vertices,
-        faces=mesh.faces,
-        normals=mesh.normals,
-        basecolor=mesh.basecolor,
-        orm=mesh.orm,
-        uv=mesh.uv,
-        tangents=mesh.tangents,
-        normal_tangent=mesh.normal_tangent,
-        name=NAME,
-    )
-    _check(content, mesh)
-    files = {f"{NAME}.glb": content}
-    if "obj" in config.formats:
-        files |= obj_files(
-            vertices=mesh.vertices,
-            faces=mesh.faces,
-            normals=mesh.normals,
-            basecolor=mesh.basecolor,
-            orm=mesh.orm,
-            uv=mesh.uv,
-            normal_tangent=mesh.normal_tangent,
-            name=NAME,
+    files = {f"{NAME}.glb": _glb(mesh)}
+    summary = _summary(mesh, len(files[f"{NAME}.glb"]))
+    for level, (coarser, error) in enumerate(_coarser(mesh, config.lods), 1):
+        name = f"{NAME}_lod{level}.glb"
+        files[name] = _glb(coarser)
+        summary[f"lod{level}_faces"] = len(coarser.faces)
+        summary[f"lod{level}_glb_bytes"] = len(files[name])
+        ctx.event(
+            "lod",
+            f"{name}: {len(coarser.faces)} faces, silhouettes {error.silhouette:.2%} and normals "
+            f"{error.normal_deg:.1f} deg off asset.glb",
+            tell=False,
         )
+    if "obj" in config.formats:
+        parts = _parts(mesh)
+        del parts["tangents"]
+        files |= obj_files(**parts)
     light = surface.environment if surface is not None else field.environment
     files["environment.exr"] = _environment_exr(light, ctx.work)
-    return ExportedAsset(files, _summary(mesh, len(content)))
+    return ExportedAsset(files, summary)
+
+
+def _parts(mesh: TexturedMesh) -> dict[str, Any]:
+    """What the writers ask for."""
+    return {field.name: getattr(mesh, field.name) for field in fields(mesh)} | {"name": NAME}
+
+
+def _glb(mesh: TexturedMesh) -> bytes:
+    """The mesh as a file, checked."""
+    parts = _parts(mesh)
+    content = glb_bytes(**parts)
+    _check(content, mesh)
+    return content
+
+
+def _coarser(mesh: TexturedMesh, levels: int) -> Iterator[tuple[TexturedMesh, ShapeError]]:
+    """Levels of detail of growing error, each decimated from the mesh before it to fewer faces."""
+    radius = fitting_radius(mesh.vertices, FOV_Y_DEG, FILL)
+    angles = orbit_angles(LOD_VIEWS, 0.0, LOD_SWING_DEG)
+    cameras = orbit_cameras(angles, radius=radius, fov_y_deg=FOV_Y_DEG, size=LOD_PICTURE_PX)
+    whole, index = torch.unique(mesh.vertices, dim=0, return_inverse=True)
+    welded = index[mesh.faces.long()].to(mesh.faces.dtype)
+    pictures = ShapePictures.of_surface(whole, welded, cameras)
+    last = CleanMesh(whole, welded)
+    for limit in COARSER[:levels]:
+        found = decimate_to_error(
+            last.vertices, last.faces, pictures, limit=limit, max_faces=len(last.faces)
+        )
+        if len(found.mesh.faces) >= len(last.faces):
+            continue  # decimation has come to its end, or the limit asks for all of them
+        last = found.mesh
+        error = pictures.error(last.vertices, last.faces)
+        yield transferred(mesh, last.vertices, last.faces), error
 
 
 def _colored(fitted: RefinedSurface, config: ExportConfig, ctx: Context) -> TexturedMesh:
@@ -127,17 +164,20 @@ def _check(content: bytes, mesh: TexturedMesh) -> None:
             f"asset.glb reads back with {len(found.vertices)} vertices and {len(found.faces)} "
             f"faces instead of {len(mesh.vertices)} and {len(mesh.faces)}"
         )
+    factor = torch.ones(3) if mesh.orm_factor is None else mesh.orm_factor
+    is_picture = mesh.basecolor.ndim == 3
     errors: dict[str, tuple[Tensor, Tensor | None, float]] = {
         "positions": (mesh.vertices, found.vertices, POSITION_TOLERANCE),
         "basecolor": (
-            srgb_from_linear(mesh.basecolor) if mesh.uv is not None else mesh.basecolor,
-            srgb_from_linear(found.basecolor) if mesh.uv is not None else found.basecolor,
+            srgb_from_linear(mesh.basecolor) if is_picture else mesh.basecolor,
+            srgb_from_linear(found.basecolor) if is_picture else found.basecolor,
             TEXTURE_TOLERANCE,
         ),
     }
     if mesh.uv is not None:
         errors["uv"] = (mesh.uv, found.uv, POSITION_TOLERANCE)
-        errors["orm"] = (mesh.orm, found.orm, TEXTURE_TOLERANCE)
+    if mesh.orm.ndim != 2:
+        errors["orm"] = (mesh.orm * factor, found.orm, TEXTURE_TOLERANCE)
     if mesh.normal_tangent is not None:
         # Decoded normals span [-1, 1], so a step is twice as large.
         errors["normals"] = (mesh.normal_tangent, found.normal_tangent, 2 * TEXTURE_TOLERANCE)
@@ -161,17 +201,20 @@ def _summary(mesh: TexturedMesh, size_bytes: int) -> dict[str, float | int | str
     """Counts and checks for the run's table."""
     _, index = torch.unique(mesh.vertices, dim=0, return_inverse=True)
     low, high = mesh.vertices.amin(0), mesh.vertices.amax(0)
+    painted = "vertex" if mesh.basecolor.ndim == 2 else "texture" if mesh.textures else "constant"
     summary: dict[str, float | int | str | bool] = {
         "faces": len(mesh.faces),
         "vertices": len(mesh.vertices),
-        "materials": "texture" if mesh.uv is not None else "vertex",
+        "materials": painted,
         "glb_bytes": size_bytes,
         "watertight": is_closed(index[mesh.faces.long()]),
         "volume": float(signed_volume(mesh.vertices, mesh.faces)),
         "longest_side": float((high - low).max()),
     }
+    if mesh.orm_factor is not None:
+        summary |= {f"{name}_map": form for name, form in _forms(mesh).items()}
     if mesh.uv is not None:
-        size = mesh.basecolor.shape[0]
+        size = max(len(image) for image in mesh.textures.values())
         texels = rasterize_uv(mesh.uv, mesh.faces, size)
         summary |= {
             "texture_size": size,
@@ -179,6 +222,22 @@ def _summary(mesh: TexturedMesh, size_bytes: int) -> dict[str, float | int | str
             "atlas_overlaps": texels.overlaps,
         }
     return summary
+
+
+def _forms(mesh: TexturedMesh) -> dict[str, str]:
+    """What each map has become: a constant, a palette or a texture."""
+    forms = {"normal": "none" if mesh.normal_tangent is None else "texture"}
+    planes = {
+        "basecolor": mesh.basecolor,
+        "occlusion": mesh.orm[..., :1],
+        "roughness": mesh.orm[..., 1:2],
+        "metallic": mesh.orm[..., 2:],
+    }
+    for name, plane in planes.items():
+        values = torch.unique(plane.reshape(-1, plane.shape[-1]), dim=0)
+        few = "constant" if len(values) == 1 else f"palette of {len(values)}"
+        forms[name] = few if len(values) <= LARGEST_PALETTE else f"texture of {len(plane)} px"
+    return forms
 
 
 EXPORT = Stage(run)

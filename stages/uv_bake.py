@@ -5,9 +5,13 @@ field, writes a `TexturedMesh`. Every texel is projected back onto the original 
 field is asked and the normal is taken; so decimation costs little colour and relief. Then
 basecolor, roughness and metallic are sharpened against the views by least squares. Tangent frames:
 MikkTSpace; atlas: xatlas with a time limit, box projection beyond it.
+
+On request the asset is no more than the views ask for: fewer faces, constants and palettes instead
+of textures, smaller textures. What was chosen, and the figures behind it, are told as events.
 """
 
 from dataclasses import replace
+from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -19,15 +23,25 @@ from stages.errors import InputError
 from stages.settings.uv_bake import UvBakeConfig
 from svim3d.mesh.atlas import unwrap
 from svim3d.mesh.cleanup import CleanMesh, clean_surface, decimate
-from svim3d.mesh.frames import bitangents, tangent_frames, tangent_from_world
+from svim3d.mesh.frames import (
+    bitangents,
+    tangent_frames,
+    tangent_from_world,
+    world_from_tangent,
+)
 from svim3d.mesh.mesh import vertex_normals
 from svim3d.mesh.projection import project_onto
 from svim3d.mesh.texels import Texels, average_down, rasterize_uv, to_image
 from svim3d.numerics import normalize
+from svim3d.render.face_budget import UNSEEN, ShapePictures, decimate_to_error
+from svim3d.render.material_maps import BakedTexels, Wanted, material_maps
 from svim3d.render.occlusion import ambient_occlusion
 from svim3d.render.texture_fit import fit_texels, texel_view
+from svim3d.render.view_pixels import ViewPixels
 
 POINTS_PER_CHUNK = 2**17  # bounds the memory of the field's intermediate values
+# Steps of the fits by which forms are compared, at least: they begin at a constant, not at a bake.
+JUDGED_ITERATIONS = 20
 SOLID = 0.99  # coverage of a pixel that holds no background
 
 
@@ -56,7 +70,7 @@ def run(
             f"wanted a surface to bake, got {len(fitted.faces)} faces of which none is sound; "
             "run the earlier stages longer or check the masks of the views"
         )
-    coarse = decimate(fine.vertices, fine.faces, max_faces=config.max_faces)
+    coarse = _decimated(fine, views, config, ctx)
     for note in (*fine.notes, *coarse.notes):
         ctx.event("mesh", note)
     ctx.report(1, 4, {"faces_fine": len(fine.faces), "faces": len(coarse.faces)})
@@ -69,18 +83,53 @@ def run(
     openness = _openness(mesh, field, config.occlusion_rays)
     values = torch.cat([values, texels.interpolate(mesh.faces, openness)], 1)
     values, texels = average_down(values, texels, config.supersample)
+    wanted = Wanted(
+        nested=config.materials == "nested",
+        sized=config.texture_sizes == "evidence",
+        prior=config.fit_prior,
+        iterations=max(config.fit_iterations, JUDGED_ITERATIONS),
+        sharpened=config.fit_iterations,
+    )
+    pixels_at = cache(lambda size: _seen(mesh, size, views))
     if config.fit_iterations:
-        values = torch.cat(
-            [_sharpened(mesh, values[:, :5], texels, views, config), values[:, 5:]], 1
-        )
-    image = to_image(values, texels)
+        fit = _sharpened(values[:, :5], texels, pixels_at(texels.size), config)
+        values = torch.cat([fit, values[:, 5:]], 1)
+    baked = _baked_texels(mesh, values, texels)
+    maps = material_maps(baked, pixels_at, views.normal_world, wanted)
+    for name, note in maps.notes.items():
+        ctx.event("material", f"{name}: {note}", tell=False)
     ctx.report(4, 4, {"coverage": len(texels.pixel) / texels.size**2})
     return replace(
         mesh,
-        basecolor=image[..., :3].clamp(0.0, 1.0),
-        orm=image[..., [8, 3, 4]].clamp(0.0, 1.0),
-        normal_tangent=normalize(image[..., 5:8]),
+        basecolor=maps.basecolor,
+        orm=maps.orm,
+        orm_factor=maps.orm_factor,
+        normal_tangent=maps.normal_tangent,
+    ).without_needless_seams()
+
+
+def _decimated(
+    fine: CleanMesh, views: MaterialViews, config: UvBakeConfig, ctx: Context
+) -> CleanMesh:
+    """At most `max_faces`, and where evidence counts no more than the views would miss."""
+    if config.faces == "fixed":
+        return decimate(fine.vertices, fine.faces, max_faces=config.max_faces)
+    found = decimate_to_error(
+        fine.vertices,
+        fine.faces,
+        ShapePictures.of_views(views.cameras, views.mask, views.normal_world),
+        limit=UNSEEN,
+        max_faces=config.max_faces,
     )
+    ctx.event(
+        "faces",
+        f"{len(found.mesh.faces)} of at most {config.max_faces} faces: against the whole surface "
+        f"the views see {found.error.silhouette:.2%} less of the silhouettes and normals "
+        f"{found.error.normal_deg:.2f} deg farther off ({UNSEEN.silhouette:.1%} and "
+        f"{UNSEEN.normal_deg:.0f} deg are allowed)",
+        tell=False,
+    )
+    return found.mesh
 
 
 def _unwrapped(
@@ -155,29 +204,60 @@ def _bake(
     return torch.cat(chunks)
 
 
-def _sharpened(
-    mesh: TexturedMesh,
-    baked: Float[Tensor, "P 5"],
-    texels: Texels,
-    views: MaterialViews,
-    config: UvBakeConfig,
-) -> Float[Tensor, "P 5"]:
-    """Texels whose rendered pixels agree with the views; those that no view sees stay as baked.
+def _baked_texels(mesh: TexturedMesh, values: Float[Tensor, "P 9"], texels: Texels) -> BakedTexels:
+    """The finished texels, with the normals that a viewer would see with and without the map."""
+    assert mesh.tangents is not None
+    local = normalize(values[:, 5:8])
+    normal, tangent, bitangent = (
+        texels.interpolate(mesh.faces, attribute)
+        for attribute in (
+            mesh.normals,
+            mesh.tangents[:, :3].contiguous(),
+            bitangents(mesh.normals, mesh.tangents),
+        )
+    )
+    return BakedTexels(
+        surface=values[:, :5],
+        occlusion=values[:, 8:],
+        local=values[:, 5:8],
+        flat=normalize(normal),
+        mapped=world_from_tangent(local, normal, tangent, bitangent),
+        texels=texels,
+    )
+
+
+def _seen(mesh: TexturedMesh, texture_size: int, views: MaterialViews) -> ViewPixels:
+    """What the views say of basecolor, roughness and metallic, and how far it counts.
 
     Pixels at the rim of the mask are left out, slanted ones count by the cosine squared, all of
     them by their confidence.
     """
     assert mesh.uv is not None
-    seen = texel_view(mesh.vertices, mesh.faces, mesh.uv, views.cameras, texture_size=texels.size)
+    seen = texel_view(mesh.vertices, mesh.faces, mesh.uv, views.cameras, texture_size=texture_size)
     images = torch.cat([views.basecolor, views.roughness, views.metallic, views.mask], -1)
     target, mask = images.reshape(-1, 6)[seen.pixel].split([5, 1], 1)
     weight = (mask >= SOLID) * seen.trust.clamp_min(0.0) ** 2
     if views.confidence is not None:
         weight = weight * views.confidence.reshape(-1, 1)[seen.pixel]
+    count, height, width, _ = views.mask.shape
+    return ViewPixels(
+        operator=seen.operator,
+        pixel=seen.pixel,
+        target=target,
+        weight=weight,
+        shape=(count, height, width),
+        texture_size=texture_size,
+    )
+
+
+def _sharpened(
+    baked: Float[Tensor, "P 5"], texels: Texels, pixels: ViewPixels, config: UvBakeConfig
+) -> Float[Tensor, "P 5"]:
+    """Texels whose rendered pixels agree with the views; those that no view sees stay as baked."""
     fitted = fit_texels(
-        seen.operator,
-        target,
-        weight,
+        pixels.operator,
+        pixels.target,
+        pixels.weight,
         to_image(baked, texels).view(-1, 5),
         prior=config.fit_prior,
         iterations=config.fit_iterations,

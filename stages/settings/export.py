@@ -20,6 +20,13 @@ class ExportConfig(StageConfig):
         description="decimate to this when phase 3 was skipped and vertices carry the colour",
     )
 
+    lods: int = Field(
+        default=0,
+        ge=0,
+        le=3,
+        description="coarser levels of detail at most, written beside it as asset_lod1.glb, ...",
+    )
+
     @field_validator("formats")
     @classmethod
     def _has_glb(cls, formats: tuple[str, ...]) -> tuple[str, ...]:

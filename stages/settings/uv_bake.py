@@ -1,5 +1,7 @@
 """Settings of the uv_bake stage."""
 
+from typing import Literal
+
 from pydantic import Field
 
 from stages.settings.base import StageConfig
@@ -17,6 +19,19 @@ class UvBakeConfig(StageConfig):
         ge=100,
         le=100_000,
         description="decimate to this; xatlas takes 0.5 s for 10k, 6 s for 20k rough faces",
+    )
+    faces: Literal["fixed", "evidence"] = Field(
+        default="fixed",
+        description="evidence: fewer than max_faces where the views would not notice "
+        "(0.2 % of silhouettes, 1 degree of normals)",
+    )
+    materials: Literal["texture", "nested"] = Field(
+        default="texture",
+        description="nested: a constant or a palette where the views do not pay for a texture",
+    )
+    texture_sizes: Literal["fixed", "evidence"] = Field(
+        default="fixed",
+        description="evidence: each map as small as its detail and the views' pixels allow (45 dB)",
     )
     min_area_share: float = Field(
         default=0.002,

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from svim3d.color import linear_from_srgb
 from svim3d.io.gltf import ALIGNMENT, pack_glb, read_gltf
-from svim3d.io.image import encode_png
+from svim3d.io.image import encode_png, encode_small_png
 from svim3d.io.obj import read_obj
 from svim3d.mesh.source_mesh import SourceMesh
 from svim3d.numerics import normalize
@@ -28,6 +28,8 @@ from svim3d.numerics import normalize
 UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5123, 5125, 5126
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
 LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
+CONSTANT, PER_VERTEX, TEXTURE = 1, 2, 3  # dimensions of a material's values
+FACTORS = ("roughnessFactor", "metallicFactor")
 MAX_SHORT_VERTICES = 65535  # index 65535 itself restarts a primitive
 
 Json = dict[str, Any]
@@ -58,31 +60,34 @@ def glb_bytes(
     faces: Int[Tensor, "F 3"],
     normals: Float[Tensor, "N 3"],
     basecolor: Float[Tensor, "*texels 3"],
-    orm: Float[Tensor, "*texels 3"],
+    orm: Float[Tensor, "*orm_texels 3"],
     uv: Float[Tensor, "N 2"] | None = None,
     tangents: Float[Tensor, "N 4"] | None = None,
-    normal_tangent: Float[Tensor, "T T 3"] | None = None,
+    normal_tangent: Float[Tensor, "M M 3"] | None = None,
+    orm_factor: Float[Tensor, "3"] | None = None,
     name: str = "asset",
 ) -> bytes:
     """A GLB with one mesh and one metallic-roughness material; equal input gives equal bytes.
 
-    With `uv`, `basecolor` and `orm` are textures. Without, they are per vertex: the colour becomes
-    COLOR_0, and since glTF knows no roughness per vertex, the material takes the mean roughness and
-    metallic of all vertices.
+    `basecolor` and `orm` are textures [T, T, 3], which need `uv`; or one value [3], which becomes
+    the material's factors; or per vertex [N, 3]: the colour becomes COLOR_0, and since glTF knows
+    no roughness per vertex, the material takes the mean roughness and metallic of all vertices.
 
     Args:
         vertices: positions.
         faces: counter-clockwise seen from outside.
         normals: unit.
         basecolor: linear in [0, 1]; a texture is stored with the sRGB curve, 8 bit.
-        orm: occlusion, roughness, metallic in [0, 1]; a texture is stored as it is, 8 bit.
+        orm: occlusion, roughness, metallic in [0, 1]; a texture is stored as it is, 8 bit. One
+            value's occlusion must be 1: glTF has no factor for it.
         uv: glTF texture coordinates, origin at the top left.
         tangents: MikkTSpace tangent and handedness.
         normal_tangent: unit, green up; needs `tangents`.
+        orm_factor: multiplies `orm`, the constant channels of which are 1; where it is given,
+            pictures are stored as small as they go.
         name: of the node, mesh and material.
     """
-    if (normal_tangent is None) != (tangents is None) or (tangents is not None and uv is None):
-        raise ValueError("a normal map, tangents and uv go together: give all or neither")
+    _check_layout(basecolor, orm, uv, tangents, normal_tangent)
     parts = _Parts()
     attributes = {
         "POSITION": parts.floats(vertices, bounds=True),
@@ -92,21 +97,11 @@ def glb_bytes(
         attributes["TANGENT"] = parts.floats(
             torch.cat([normalize(tangents[:, :3]), tangents[:, 3:]], 1)
         )
-    shading: Json = {}
-    material: Json = {"name": name, "pbrMetallicRoughness": shading}
-    if uv is None:
+    if basecolor.ndim == PER_VERTEX:
         attributes["COLOR_0"] = parts.floats(basecolor.clamp(0.0, 1.0))
-        roughness, metallic = orm[:, 1:].mean(0).clamp(0.0, 1.0).tolist()
-        shading |= {"roughnessFactor": roughness, "metallicFactor": metallic}
-    else:
+    if uv is not None:
         attributes["TEXCOORD_0"] = parts.floats(uv)
-        shading["baseColorTexture"] = parts.texture("basecolor", encode_png(basecolor, srgb=True))
-        shading["metallicRoughnessTexture"] = parts.texture("orm", encode_png(orm))
-        if bool((orm[..., 0] < 1.0).any()):
-            material["occlusionTexture"] = dict(shading["metallicRoughnessTexture"])
-        if normal_tangent is not None:
-            encoded = encode_png(normal_tangent * 0.5 + 0.5)
-            material["normalTexture"] = parts.texture("normal", encoded)
+    material = {"name": name, **_material(parts, basecolor, orm, normal_tangent, orm_factor)}
     primitive = {
         "attributes": attributes,
         "indices": parts.indices(faces, len(vertices)),
@@ -123,6 +118,57 @@ def glb_bytes(
     )
 
 
+def _check_layout(
+    basecolor: Tensor,
+    orm: Tensor,
+    uv: Tensor | None,
+    tangents: Tensor | None,
+    normal_tangent: Tensor | None,
+) -> None:
+    """Refuse what no glTF material can mean."""
+    if (normal_tangent is None) != (tangents is None) or (tangents is not None and uv is None):
+        raise ValueError("a normal map, tangents and uv go together: give all or neither")
+    is_textured = TEXTURE in (basecolor.ndim, orm.ndim) or normal_tangent is not None
+    if is_textured != (uv is not None):
+        raise ValueError("textures and uv go together: give both or neither")
+    if orm.ndim == CONSTANT and float(orm[0]) != 1.0:
+        raise ValueError("occlusion needs a texture: glTF has no factor for it")
+
+
+def _material(
+    parts: "_Parts",
+    basecolor: Tensor,
+    orm: Tensor,
+    normal_tangent: Tensor | None,
+    orm_factor: Tensor | None,
+) -> Json:
+    """Factors and textures of the material."""
+    encode = encode_png if orm_factor is None else encode_small_png
+    factor = torch.ones(3) if orm_factor is None else orm_factor
+    shading: Json = {}
+    material: Json = {"pbrMetallicRoughness": shading}
+    if basecolor.ndim == CONSTANT:
+        shading["baseColorFactor"] = [*basecolor.clamp(0.0, 1.0).tolist(), 1.0]
+    elif basecolor.ndim == TEXTURE:
+        shading["baseColorTexture"] = parts.texture("basecolor", encode(basecolor, srgb=True))
+    if orm.ndim == TEXTURE:
+        reflects = orm_factor is None or bool((orm[..., 1:] < 1.0).any())
+        occludes = bool((orm[..., 0] < 1.0).any())
+        texture = parts.texture("orm", encode(orm)) if reflects or occludes else {}
+        if reflects:
+            shading["metallicRoughnessTexture"] = texture
+        if occludes:
+            material["occlusionTexture"] = dict(texture)
+    else:
+        factor = factor * (orm if orm.ndim == CONSTANT else orm.mean(0))
+    for name, value in zip(FACTORS, factor[1:].clamp(0.0, 1.0).tolist(), strict=True):
+        if value != 1.0 or orm.ndim != TEXTURE:
+            shading[name] = value
+    if normal_tangent is not None:
+        material["normalTexture"] = parts.texture("normal", encode(normal_tangent * 0.5 + 0.5))
+    return material
+
+
 @dataclass(frozen=True)
 class ReopenedGlb:
     """What another reader (trimesh) makes of a GLB, in the terms of `glb_bytes`.
@@ -131,8 +177,8 @@ class ReopenedGlb:
         vertices: positions.
         faces: vertex indices.
         uv: glTF texture coordinates, or None.
-        basecolor: linear; texture or per vertex.
-        orm: texture, or None where the material has factors.
+        basecolor: linear; texture, per vertex, or one colour to 8 bits.
+        orm: texture times factors, or the factors alone, occlusion being 1.
         normal_tangent: texture, or None.
     """
 
@@ -140,8 +186,8 @@ class ReopenedGlb:
     faces: Int[Tensor, "F 3"]
     uv: Float[Tensor, "N 2"] | None
     basecolor: Float[Tensor, "*texels 3"]
-    orm: Float[Tensor, "T T 3"] | None
-    normal_tangent: Float[Tensor, "T T 3"] | None
+    orm: Float[Tensor, "*orm_texels 3"]
+    normal_tangent: Float[Tensor, "M M 3"] | None
 
 
 def reopen_glb(content: bytes) -> ReopenedGlb:
@@ -157,11 +203,22 @@ def reopen_glb(content: bytes) -> ReopenedGlb:
         return torch.from_numpy(np.asarray(picture.convert("RGB"), np.float32) / 255.0)
 
     basecolor, normal = texture("baseColorTexture"), texture("normalTexture")
-    if basecolor is None:
+    if basecolor is not None:
+        painted = linear_from_srgb(basecolor)
+    elif "color" in getattr(mesh.visual, "vertex_attributes", {}):
         colors = mesh.visual.vertex_attributes["color"]  # COLOR_0, linear as stored
         painted = torch.from_numpy(np.array(colors, np.float32))
     else:
-        painted = linear_from_srgb(basecolor)
+        colour = np.asarray(getattr(material, "baseColorFactor", None), np.float32)[:3]
+        painted = torch.from_numpy(colour / 255.0)
+    factors = [getattr(material, name, None) for name in FACTORS]
+    orm = torch.tensor([1.0, *(1.0 if f is None else f for f in factors)])
+    for name, channels in (("metallicRoughnessTexture", [1, 2]), ("occlusionTexture", [0])):
+        picture = texture(name)
+        if picture is not None:
+            if orm.ndim == CONSTANT:
+                orm = orm.expand_as(picture).clone()
+            orm[..., channels] *= picture[..., channels]
     uv = getattr(mesh.visual, "uv", None)
     # trimesh turns v upwards.
     upright = None if uv is None else np.asarray(uv, np.float64) * [1.0, -1.0] + [0.0, 1.0]
@@ -170,7 +227,7 @@ def reopen_glb(content: bytes) -> ReopenedGlb:
         faces=torch.from_numpy(np.asarray(mesh.faces, np.int64)),
         uv=None if upright is None else torch.from_numpy(upright.astype(np.float32)),
         basecolor=painted,
-        orm=texture("metallicRoughnessTexture"),
+        orm=orm,
         normal_tangent=None if normal is None else normal * 2.0 - 1.0,
     )
 

@@ -76,6 +76,25 @@ def encode_png(image: Float[Tensor, "H W C"], *, srgb: bool = False) -> bytes:
         image: 1 (grey), 2 (grey, opacity), 3 (colour) or 4 (colour, opacity) channels.
         srgb: encode the colour channels, given in linear light, by the sRGB curve.
     """
+    picture = _picture(image, srgb=srgb)
+    return _png(picture)
+
+
+def encode_small_png(image: Float[Tensor, "H W C"], *, srgb: bool = False) -> bytes:
+    """The same pixels as `encode_png` stores, of at most 256 colours as indices into a palette."""
+    picture = _picture(image, srgb=srgb)
+    pixels = np.atleast_3d(np.asarray(picture))
+    if pixels.shape[-1] == 3:
+        colours, index = np.unique(pixels.reshape(-1, 3), axis=0, return_inverse=True)
+        if len(colours) <= PALETTE_SIZE:
+            indices = index.reshape(pixels.shape[:2]).astype(np.uint8)
+            picture = Image.fromarray(indices, "P")
+            picture.putpalette(colours.tobytes())
+    return _png(picture)
+
+
+def _picture(image: Float[Tensor, "H W C"], *, srgb: bool) -> Image.Image:
+    """Eight bits of an image in [0, 1]."""
     if image.ndim != 3 or image.shape[-1] not in MODES:
         raise ValueError(
             f"wanted an image [H, W, 1 to 4], got {list(image.shape)}; put channels last"
@@ -84,7 +103,10 @@ def encode_png(image: Float[Tensor, "H W C"], *, srgb: bool = False) -> bytes:
     values = _on_colour(image, srgb_from_linear) if srgb else image
     pixels = (values.clamp(0.0, 1.0) * MAX_8BIT).round().to(torch.uint8).numpy()
     grey = pixels.shape[-1] == 1
-    picture = Image.fromarray(pixels[..., 0] if grey else pixels, MODES[pixels.shape[-1]])
+    return Image.fromarray(pixels[..., 0] if grey else pixels, MODES[pixels.shape[-1]])
+
+
+def _png(picture: Image.Image) -> bytes:
     buffer = io.BytesIO()
     picture.save(buffer, "PNG", compress_level=COMPRESSION_LEVEL)
     return buffer.getvalue()

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from svim3d.color import linear_from_srgb, srgb_from_linear
-from svim3d.io.image import decode_image, encode_png
+from svim3d.io.image import decode_image, encode_png, encode_small_png
 from svim3d.mesh.source_mesh import SourceMaterial, SourceMesh, complete, merge
 from svim3d.numerics import normalize
 
@@ -139,18 +139,20 @@ def obj_files(
     faces: Int[Tensor, "F 3"],
     normals: Float[Tensor, "N 3"],
     basecolor: Float[Tensor, "*texels 3"],
-    orm: Float[Tensor, "*texels 3"],
+    orm: Float[Tensor, "*orm_texels 3"],
     uv: Float[Tensor, "N 2"] | None = None,
-    normal_tangent: Float[Tensor, "T T 3"] | None = None,
+    normal_tangent: Float[Tensor, "M M 3"] | None = None,
+    orm_factor: Float[Tensor, "3"] | None = None,
     name: str = "asset",
 ) -> dict[str, bytes]:
     """OBJ, MTL and PNG files by name; equal input gives equal bytes.
 
-    Arguments as for `svim3d.io.glb.glb_bytes`; without `uv` the colours go behind the positions
-    (sRGB, as MeshLab reads them) and the material takes the mean roughness and metallic.
+    Arguments as for `svim3d.io.glb.glb_bytes`; colours per vertex go behind the positions (sRGB, as
+    MeshLab reads them) and the material takes the mean roughness and metallic. A map's channel that
+    is one throughout is left to its factor. MTL has no occlusion.
     """
     numbers = vertices.detach().cpu().double()
-    if uv is None:
+    if basecolor.ndim == 2:
         numbers = torch.cat([numbers, srgb_from_linear(basecolor).cpu().double()], 1)
     lines = [f"mtllib {name}.mtl", f"o {name}"]
     lines += _rows("v", numbers)
@@ -164,18 +166,24 @@ def obj_files(
 
     material = [f"newmtl {name}", "illum 2", "Ks 0 0 0"]
     files: dict[str, bytes] = {}
-    if uv is None:
-        roughness, metallic = orm[:, 1:].mean(0).clamp(0.0, 1.0).tolist()
-        material += ["Kd 1 1 1", f"Pr {roughness:.6f}", f"Pm {metallic:.6f}"]
-    else:
-        files[f"{name}_basecolor.png"] = encode_png(basecolor, srgb=True)
-        files[f"{name}_roughness.png"] = encode_png(orm[..., 1:2])
-        files[f"{name}_metallic.png"] = encode_png(orm[..., 2:3])
-        material += ["Kd 1 1 1", f"map_Kd {name}_basecolor.png"]
-        material += [f"map_Pr {name}_roughness.png", f"map_Pm {name}_metallic.png"]
-        if normal_tangent is not None:
-            files[f"{name}_normal.png"] = encode_png(normal_tangent * 0.5 + 0.5)
-            material.append(f"norm {name}_normal.png")
+    encode = encode_png if orm_factor is None else encode_small_png
+    factor = torch.ones(3) if orm_factor is None else orm_factor
+    colour = basecolor if basecolor.ndim == 1 else torch.ones(3)
+    material.append("Kd " + " ".join(f"{value:.6g}" for value in colour.tolist()))
+    if basecolor.ndim == 3:
+        files[f"{name}_basecolor.png"] = encode(basecolor, srgb=True)
+        material.append(f"map_Kd {name}_basecolor.png")
+    for place, key, channel in ((1, "Pr", "roughness"), (2, "Pm", "metallic")):
+        plane = orm[..., place : place + 1]
+        if orm.ndim == 3 and (orm_factor is None or bool((plane < 1.0).any())):
+            files[f"{name}_{channel}.png"] = encode(plane)
+            material.append(f"map_{key} {name}_{channel}.png")
+        else:
+            value = float(factor[place] * plane.mean())
+            material.append(f"{key} {min(max(value, 0.0), 1.0):.6f}")
+    if normal_tangent is not None:
+        files[f"{name}_normal.png"] = encode(normal_tangent * 0.5 + 0.5)
+        material.append(f"norm {name}_normal.png")
     text = {f"{name}.obj": lines, f"{name}.mtl": material}
     return {file: ("\n".join(rows) + "\n").encode() for file, rows in text.items()} | files
 

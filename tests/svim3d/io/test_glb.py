@@ -10,6 +10,7 @@ import pygltflib
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 from svim3d.io.glb import glb_bytes, read_mesh, reopen_glb
 
@@ -138,7 +139,93 @@ def test_a_normal_map_without_tangents_is_refused():
         glb_bytes(**asset)
 
 
-@pytest.mark.parametrize("asset", [quad(), painted()], ids=["textured", "painted"])
+def constant():
+    """A square of one material, without texture coordinates."""
+    asset = painted()
+    asset["basecolor"] = torch.tensor([0.8, 0.4, 0.123456])
+    asset["orm"] = torch.tensor([1.0, 0.31, 0.75])
+    return asset
+
+
+def sparse():
+    """A palette for the colour, factors for what does not vary, no normal map."""
+    asset = quad()
+    del asset["tangents"], asset["normal_tangent"]
+    columns = torch.arange(8) < 3
+    asset["basecolor"] = torch.where(columns[None, :, None], 0.2, torch.tensor([0.9, 0.5, 0.1]))
+    asset["basecolor"] = asset["basecolor"].expand(8, 8, 3).contiguous()
+    asset["orm"] = torch.ones(4, 4, 3)
+    asset["orm"][:2, :, 2] = 0.0
+    asset["orm_factor"] = torch.tensor([1.0, 0.4567, 1.0])
+    return asset
+
+
+def test_one_value_becomes_factors_and_no_texture():
+    asset = constant()
+    content = glb_bytes(**asset)
+    document = document_of(content)[0]
+    assert not {"textures", "images", "samplers"} & set(document)
+    assert set(document["meshes"][0]["primitives"][0]["attributes"]) == {"POSITION", "NORMAL"}
+    shading = document["materials"][0]["pbrMetallicRoughness"]
+    assert shading["baseColorFactor"] == [*asset["basecolor"].tolist(), 1.0]
+    assert shading["roughnessFactor"] == pytest.approx(0.31)
+    assert shading["metallicFactor"] == 0.75
+    found = reopen_glb(content)
+    assert found.uv is None
+    assert (found.basecolor - asset["basecolor"]).abs().max() <= 0.51 / 255  # trimesh rounds
+    assert torch.allclose(found.orm, asset["orm"])
+
+
+def test_factors_stand_beside_textures_of_what_varies(tmp_path):
+    asset = sparse()
+    content = glb_bytes(**asset)
+    shading = document_of(content)[0]["materials"][0]["pbrMetallicRoughness"]
+    assert shading["roughnessFactor"] == pytest.approx(0.4567)
+    assert "metallicFactor" not in shading  # 1, beside its texture
+    assert "baseColorFactor" not in shading
+    assert "occlusionTexture" not in document_of(content)[0]["materials"][0]
+    assert torch.allclose(reopen_glb(content).orm, asset["orm"] * asset["orm_factor"])
+    (tmp_path / "asset.glb").write_bytes(content)
+    material = read_mesh(tmp_path / "asset.glb").materials[0]
+    assert material.roughness_factor == pytest.approx(0.4567)
+    assert torch.equal(material.roughness_metallic, asset["orm"][..., 1:])
+    assert (material.basecolor - asset["basecolor"]).abs().max() < 0.01
+
+
+def test_few_colours_are_stored_as_indices():
+    noisy, few = quad(64), quad(64)
+    for asset in (noisy, few):
+        asset["orm_factor"] = torch.ones(3)
+    few["basecolor"] = (few["basecolor"] > 0.5).float()
+    content = glb_bytes(**few)
+    document, binary = document_of(content)
+    stored = {}
+    for image in document["images"]:
+        view = document["bufferViews"][image["bufferView"]]
+        start = view["byteOffset"]
+        stored[image["name"]] = Image.open(io.BytesIO(binary[start : start + view["byteLength"]]))
+    assert stored["basecolor"].mode == "P"
+    assert stored["orm"].mode == "RGB"
+    assert torch.equal(reopen_glb(content).basecolor, few["basecolor"])
+    assert glb_bytes(**few) == content
+    assert len(content) < len(glb_bytes(**noisy)) - 9000  # 3 of 8 x 3 bits of 4096 texels
+
+
+def test_what_no_material_can_mean_is_refused():
+    with pytest.raises(ValueError, match="give both or neither"):
+        glb_bytes(**constant() | {"uv": quad()["uv"]})
+    textured = {name: quad()[name] for name in ("basecolor", "orm")}
+    with pytest.raises(ValueError, match="give both or neither"):
+        glb_bytes(**constant() | textured)
+    with pytest.raises(ValueError, match="occlusion needs a texture"):
+        glb_bytes(**constant() | {"orm": torch.tensor([0.5, 0.5, 0.5])})
+
+
+@pytest.mark.parametrize(
+    "asset",
+    [quad(), painted(), constant(), sparse()],
+    ids=["textured", "painted", "constant", "sparse"],
+)
 @pytest.mark.skipif("GLTF_VALIDATOR" not in os.environ, reason="path of the node module not set")
 def test_khronos_validator_has_nothing_to_remark(asset):
     report = subprocess.run(

@@ -66,3 +66,22 @@ def test_an_obj_without_faces_is_refused(tmp_path):
     file.write_text("v 0 0 0\n")
     with pytest.raises(ValueError, match=r"a\.obj"):
         read_mesh(file)
+
+
+def test_one_value_becomes_factors_and_maps_hold_only_what_varies(tmp_path):
+    wanted = asset() | {"uv": None, "normal_tangent": None}
+    wanted |= {"basecolor": torch.tensor([0.5, 0.25, 0.125])}
+    wanted |= {"orm": torch.tensor([1.0, 0.3, 0.9])}
+    files = obj_files(**wanted)
+    assert set(files) == {"asset.obj", "asset.mtl"}
+    assert b"vt " not in files["asset.obj"]
+    material = read_mesh(write(tmp_path, files)).materials[0]
+    assert material.basecolor_factor == (0.5, 0.25, 0.125)
+    assert (material.roughness_factor, material.metallic_factor) == pytest.approx((0.3, 0.9))
+    varied = asset() | {"orm_factor": torch.tensor([1.0, 0.4, 1.0])}
+    varied["orm"][..., 1] = 1.0
+    files = obj_files(**varied)
+    assert "asset_roughness.png" not in files
+    material = read_mesh(write(tmp_path, files)).materials[0]
+    assert material.roughness_factor == pytest.approx(0.4)
+    assert torch.allclose(material.roughness_metallic[..., 1], varied["orm"][..., 2], atol=1e-6)
