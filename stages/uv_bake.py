@@ -26,6 +26,7 @@ from svim3d.mesh.texels import Texels, average_down, rasterize_uv, to_image
 from svim3d.numerics import normalize
 from svim3d.render.occlusion import ambient_occlusion
 from svim3d.render.texture_fit import fit_texels, texel_view
+from svim3d.render.view_warps import ViewCorrections, read_through
 
 POINTS_PER_CHUNK = 2**17  # bounds the memory of the field's intermediate values
 SOLID = 0.99  # coverage of a pixel that holds no background
@@ -70,9 +71,9 @@ def run(
     values = torch.cat([values, texels.interpolate(mesh.faces, openness)], 1)
     values, texels = average_down(values, texels, config.supersample)
     if config.fit_iterations:
-        values = torch.cat(
-            [_sharpened(mesh, values[:, :5], texels, views, config), values[:, 5:]], 1
-        )
+        corrections = fitted.corrections if config.correct_views else None
+        sharpened = _sharpened(mesh, values[:, :5], texels, views, corrections, config)
+        values = torch.cat([sharpened, values[:, 5:]], 1)
     image = to_image(values, texels)
     ctx.report(4, 4, {"coverage": len(texels.pixel) / texels.size**2})
     return replace(
@@ -160,20 +161,30 @@ def _sharpened(
     baked: Float[Tensor, "P 5"],
     texels: Texels,
     views: MaterialViews,
+    corrections: ViewCorrections | None,
     config: UvBakeConfig,
 ) -> Float[Tensor, "P 5"]:
     """Texels whose rendered pixels agree with the views; those that no view sees stay as baked.
 
     Pixels at the rim of the mask are left out, slanted ones count by the cosine squared, all of
-    them by their confidence.
+    them by their confidence. Views are read through their warps, if they have any.
     """
     assert mesh.uv is not None
     seen = texel_view(mesh.vertices, mesh.faces, mesh.uv, views.cameras, texture_size=texels.size)
     images = torch.cat([views.basecolor, views.roughness, views.metallic, views.mask], -1)
-    target, mask = images.reshape(-1, 6)[seen.pixel].split([5, 1], 1)
-    weight = (mask >= SOLID) * seen.trust.clamp_min(0.0) ** 2
     if views.confidence is not None:
-        weight = weight * views.confidence.reshape(-1, 1)[seen.pixel]
+        images = torch.cat([images, views.confidence], -1)
+    flat = images.reshape(-1, images.shape[-1])
+    if corrections is None:
+        shown, vouched = flat[seen.pixel], None
+    else:
+        size = views.cameras.height, views.cameras.width
+        shown, vouched = read_through(corrections, flat, seen.pixel, *size)
+    target, mask, confidence = shown.split([5, 1, shown.shape[1] - 6], 1)
+    weight = (mask >= SOLID) * seen.trust.clamp_min(0.0) ** 2
+    for further in (confidence, vouched):
+        if further is not None and further.shape[1]:
+            weight = weight * further
     fitted = fit_texels(
         seen.operator,
         target,
