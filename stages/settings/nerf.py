@@ -69,7 +69,7 @@ class NerfConfig(StageConfig):
     begins at one half."""
     warp_limit: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.12
     """Largest shift of a picture's corner by its homography, in half pictures."""
-    warp_gain: Annotated[float, Field(gt=0.0, le=1.0)] = 0.3
+    warp_gain: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
     """Share of the missing shift by which a homography moves every eight steps, at first."""
     warp_reach: Annotated[float, Field(ge=0.0, le=0.1)] = 0.02
     """Distance over which a view's slope is taken when its homography is fitted, as a share of

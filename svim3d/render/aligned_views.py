@@ -49,7 +49,8 @@ class AlignedViews:
         self._pictures = torch.cat([p.flatten(0, 2) for p in planes.values()], 1)
         self._reference, self._weigh = reference, weigh
         zeros = self._pictures.new_zeros
-        self._residual, self._sum, self._count, self._rejections = zeros(4, len(cameras)).unbind()
+        self._residual = zeros(len(cameras)) - 1.0  # of views never seen
+        self._sum, self._count, self._rejections = zeros(3, len(cameras)).unbind()
         self.weights = torch.ones_like(self._residual) if start is None else start.weights.clone()
 
     @property
@@ -166,9 +167,9 @@ class AlignedViews:
             return
         fresh = self._sum / self._count.clamp_min(1.0)
         mixed = RESIDUAL_MEMORY * self._residual + (1.0 - RESIDUAL_MEMORY) * fresh
-        mixed = torch.where(self._residual > 0.0, mixed, fresh)
+        mixed = torch.where(self._residual >= 0.0, mixed, fresh)
         self._residual = torch.where(self._count > 0.0, mixed, self._residual)
-        if bool((self._residual > 0.0).all()):
+        if bool((self._residual >= 0.0).all()):
             self.weights = view_weights(self._residual, self._reference)
         self._sum.zero_()
         self._count.zero_()

@@ -28,7 +28,7 @@ from svim3d.render.view_warps import CORNERS, FREEDOMS
 
 FEATURES = ("basecolor", "mask", "normal_world", "roughness", "metallic")
 SCALES = (1.0, 1.0, 0.5, 0.5, 0.5)  # normals and the rest are drawn less surely than colours
-OUTLIER = 0.3  # a difference from which on pixels count ever less: not moved, but another thing
+OUTLIER = 1.0  # a difference from which on pixels count ever less: not moved, but another thing
 MEMORY = 0.9  # share of the structure tensor that an update keeps from before
 WEAK_SHARE = 3e-3  # of a view's best determined direction: a weaker one is noise
 WORTH = 0.1  # of what a view differs by anyway; a warp that changes it by less is none
@@ -62,9 +62,13 @@ class CommonMotion:
 
     @classmethod
     def of(cls, cameras: Cameras, reference: int) -> Self:
-        """Similarities of a plane that faces each camera; the reference counts as all others do."""
-        motions = _similarity_shifts(cameras)
+        """Similarities of a plane that faces each camera, and one warp for all views.
+
+        The reference counts as much as all others together.
+        """
         views = len(cameras)
+        alike = torch.eye(FREEDOMS, dtype=torch.float64, device=cameras.c2w.device)
+        motions = torch.cat([_similarity_shifts(cameras), alike.expand(views, -1, -1)], 2)
         weight = torch.ones(views, 1, 1, dtype=motions.dtype, device=motions.device)
         weight[reference] = views - 1.0
         flat = motions.flatten(0, 1)
@@ -130,7 +134,8 @@ class ViewAlignment:
     ) -> None:
         self.height, self.width, self.views = cameras.height, cameras.width, len(cameras)
         self.reference, self.limit = reference, limit
-        self._pictures = features(pictures).flatten(0, 2)
+        # What is no number is for the losses to complain of.
+        self._pictures = features(pictures).flatten(0, 2).nan_to_num()
         zeros = self._pictures.new_zeros
         self.shifts = zeros(self.views, 4, 2) if shifts is None else shifts.clone()
         self._common = CommonMotion.of(cameras, reference)
