@@ -13,6 +13,8 @@ from svim3d.render.registration import ViewAlignment, features
 from svim3d.render.view_trust import view_weights
 from svim3d.render.view_warps import ViewCorrections
 
+DOUBT = "doubt"  # name of the plane that is not zero where a view is not to be trusted at all
+MIN_COUNT = 1e-3  # guards the division by the pixels of a view of which none was seen
 RESIDUAL_MEMORY = 0.8  # share of a view's residual that an update keeps from before
 
 
@@ -38,6 +40,7 @@ class AlignedViews:
         weigh: bool,
         start: ViewCorrections | None = None,
     ) -> None:
+        planes = _without_doubtful(planes)
         self.alignment = ViewAlignment(
             cameras,
             planes,
@@ -86,6 +89,8 @@ class AlignedViews:
         size = alignment.height, alignment.width
         values, weight = view_warps.read_through(self.corrections, self._pictures, flat, *size)
         named = dict(zip(self._names, values.split(self._widths, 1), strict=True))
+        if DOUBT in named:
+            weight = weight * (named.pop(DOUBT) == 0.0)
         named["confidence"] = weight * named.get("confidence", 1.0)
         return {name: value.view(*pixels.shape, -1) for name, value in named.items()}
 
@@ -107,7 +112,7 @@ class AlignedViews:
         if not bool(self.alignment.shifts[view].any()):
             return warped, False
         own = dict(zip(self._names, self._pictures[pixels].split(self._widths, 1), strict=True))
-        own = {name: value.view(height, width, -1) for name, value in own.items()}
+        own = {n: value.view(height, width, -1) for n, value in own.items() if n != DOUBT}
         own["confidence"] = self.weights[view] * own.get("confidence", torch.ones_like(own["mask"]))
         both = torch.minimum(warped["confidence"], own["confidence"])
         losses = [
@@ -137,7 +142,8 @@ class AlignedViews:
             self.alignment.observe(pixels, shown, targets["confidence"])
             if self._weigh:
                 differences = (shown - features(targets)).square().sum(1).nan_to_num()
-                seen = (torch.maximum(rendered["mask"], targets["mask"])[:, 0] > 0.5).float()
+                either = torch.maximum(rendered["mask"], targets["mask"]) > 0.5
+                seen = (either * targets["confidence"])[:, 0]
                 view = pixels // (self.alignment.height * self.alignment.width)
                 self._sum.index_add_(0, view, differences * seen)
                 self._count.index_add_(0, view, seen)
@@ -165,7 +171,7 @@ class AlignedViews:
         self.alignment.update(gain)
         if not self._weigh:
             return
-        fresh = self._sum / self._count.clamp_min(1.0)
+        fresh = self._sum / self._count.clamp_min(MIN_COUNT)
         mixed = RESIDUAL_MEMORY * self._residual + (1.0 - RESIDUAL_MEMORY) * fresh
         mixed = torch.where(self._residual >= 0.0, mixed, fresh)
         self._residual = torch.where(self._count > 0.0, mixed, self._residual)
@@ -173,3 +179,17 @@ class AlignedViews:
             self.weights = view_weights(self._residual, self._reference)
         self._sum.zero_()
         self._count.zero_()
+
+
+def _without_doubtful(
+    planes: Mapping[str, Float[Tensor, "V H W _"]],
+) -> dict[str, Float[Tensor, "V H W _"]]:
+    """The planes, and that of the doubt, with nothing where no confidence is.
+
+    Reading between pixels must not carry what is there to its neighbours.
+    """
+    if "confidence" not in planes:
+        return dict(planes)
+    known = (planes["confidence"] > 0.0).float()
+    kept = {name: torch.where(known > 0.0, plane, 0.0) for name, plane in planes.items()}
+    return kept | {DOUBT: 1.0 - known}

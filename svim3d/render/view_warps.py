@@ -26,7 +26,7 @@ class ViewCorrections:
 
     Attributes:
         shifts: corner shifts of the warps.
-        weights: in (0, 1], 1 for a view that agrees with the others.
+        weights: in [0, 1], 1 for a view that agrees with the others.
     """
 
     shifts: Float[Tensor, "V 4 2"]
@@ -159,13 +159,15 @@ def read(
     own = torch.stack([pixels % width, pixels // width % height], 1)
     place = torch.minimum((own + shift * (0.5 * size)).clamp_min(0.0), size - 1.0)
     corner = torch.minimum(place.detach().floor(), size - 2.0)
-    fx, fy = (place - corner).unbind(1)
+    right, down = (place - corner).split(1, 1)
     column, row = corner.long().unbind(1)
     first = pixels - own[:, 1] * width - own[:, 0] + row * width + column
     index = torch.stack([first, first + 1, first + width, first + width + 1], 1)
-    weights = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], 1)
     taps = pictures.index_select(0, index.reshape(-1)).view(*index.shape, -1)
-    return (weights[..., None] * taps).sum(1)
+    # In this form a picture of one value is read as that value to the bit.
+    left = taps[:, 0::2]
+    upper, lower = (left + right[:, None] * (taps[:, 1::2] - left)).unbind(1)
+    return upper + down * (lower - upper)
 
 
 def read_through(

@@ -136,3 +136,19 @@ def test_a_whole_view_teaches_by_its_pixels_on_an_object():
     count = float(views.alignment._count[3])
     assert count == pytest.approx(float((shown["mask"][3] > 0).sum()) / 2, abs=1)
     assert float(views.alignment._count.sum()) == count
+
+
+def test_what_has_no_confidence_leaves_no_trace_between_pixels():
+    start = moved(1, (2.0 / SIZE * 0.5, 0.0))
+    start.shifts[2:5] = 0.01
+    confidence = torch.ones(VIEWS, SIZE, SIZE, 1)
+    confidence[1:3, 8:14, 8:14] = 0.0
+    learnt = []
+    for nonsense in (0.0, 7.0):
+        shown = {n: torch.where(confidence > 0.0, p, nonsense) for n, p in planes().items()}
+        views = views_of(start, shown | {"confidence": confidence})
+        targets = views.targets(torch.arange(VIEWS * SIZE * SIZE))
+        weighted = targets["basecolor"] * targets["confidence"]
+        assert float(weighted.max()) <= 0.75
+        learnt.append([weighted, *observed(views).state().values()])
+    assert all(torch.equal(a, b) for a, b in zip(*learnt, strict=True))
