@@ -325,7 +325,7 @@ def run(
         material_spec=fit.materials.spec,
         material_state={n: t.detach().cpu() for n, t in fit.materials.state_dict().items()},
         environment=fit.environment.detach().cpu(),
-        corrections=field.corrections if aligned is None else aligned.corrections,
+        corrections=field.corrections if aligned is None else aligned.corrections.to("cpu"),
     )
 
 

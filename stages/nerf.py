@@ -392,7 +392,7 @@ def run(
         material_spec=fit.materials.spec,
         material_state={n: t.detach().cpu() for n, t in fit.materials.state_dict().items()},
         environment=fit.log_environment.detach().exp().cpu(),
-        corrections=None if aligned is None else aligned.corrections,
+        corrections=None if aligned is None else aligned.corrections.to("cpu"),
     )
 
 

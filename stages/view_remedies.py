@@ -32,7 +32,7 @@ def align_views(
         reference=reference,
         limit=config.warp_limit,
         weigh=config.weigh_views,
-        start=start,
+        start=None if start is None else start.to(cameras.c2w.device),
     )
 
 

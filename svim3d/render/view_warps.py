@@ -36,6 +36,10 @@ class ViewCorrections:
         """Named for a file or a checkpoint."""
         return {"views.shifts": self.shifts, "views.weights": self.weights}
 
+    def to(self, device: torch.device | str) -> "ViewCorrections":
+        """The same on another device."""
+        return ViewCorrections(self.shifts.to(device), self.weights.to(device))
+
     @classmethod
     def taken_from(cls, tensors: dict[str, Tensor]) -> Self | None:
         """Those of `tensors`, taken out of the dictionary; None if there are none."""
