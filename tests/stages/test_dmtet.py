@@ -125,9 +125,9 @@ def test_a_moved_view_is_found_and_read_where_it_is(views, field, make_context):
     refined = DMTET.run(moved, good, config=config, ctx=make_context("dmtet"))
     assert refined.corrections is not None
     across = refined.corrections.shifts[..., 0].mean(1) * 64 / 2
-    # Some of it moves the object: there are few views, and a sphere shows little.
-    assert float(across[2]) == pytest.approx(1.5, abs=0.6)
-    assert float(across[[0, 1, 3, 4, 5]].abs().max()) < 0.8
+    # Of six views one has much in common with all: they share in its way back.
+    others = across[[0, 1, 3, 4, 5]]
+    assert float(across[2] - others.mean()) == pytest.approx(2.0, abs=0.8)
     off = config.model_copy(update={"warp_start": 1.0})
     assert DMTET.run(views, field, config=off, ctx=make_context("dmtet")).corrections is None
 
