@@ -23,6 +23,7 @@ from svim3d.io.weights import load_tensors, save_tensors
 from svim3d.mesh.marching import extract_surface
 from svim3d.mesh.painted_mesh import PaintedMesh
 from svim3d.numerics import normalize
+from svim3d.render.view_warps import ViewCorrections
 from svim3d.shading.environment import latlong_from_octahedral
 
 
@@ -141,6 +142,7 @@ class FittedField:
         material_spec: shape of the material field.
         material_state: its parameters (`MaterialField.state_dict()`).
         environment: octahedral radiance as optimised with the field.
+        corrections: how the views have to be read; None where that was not asked.
     """
 
     sdf: Float[Tensor, "n n n"]
@@ -148,10 +150,12 @@ class FittedField:
     material_spec: MaterialFieldSpec
     material_state: dict[str, Tensor]
     environment: Float[Tensor, "N N 3"]
+    corrections: ViewCorrections | None = None
 
     def save(self, folder: Path) -> None:
         """Write one safetensors file and a readable spec."""
         tensors = {"sdf": self.sdf, "environment": self.environment}
+        tensors |= {} if self.corrections is None else self.corrections.tensors()
         tensors |= {f"material.{name}": value for name, value in self.material_state.items()}
         save_tensors(folder / "field.safetensors", tensors)
         spec = {"half_extent": self.half_extent, "materials": asdict(self.material_spec)}
@@ -165,6 +169,7 @@ class FittedField:
         return cls(
             sdf=tensors.pop("sdf"),
             environment=tensors.pop("environment"),
+            corrections=ViewCorrections.taken_from(tensors),
             half_extent=spec["half_extent"],
             material_spec=MaterialFieldSpec(**spec["materials"]),
             material_state={name.removeprefix("material."): t for name, t in tensors.items()},
@@ -182,6 +187,7 @@ class FittedField:
             material_spec=self.material_spec,
             material_state=self.material_state,
             environment=self.environment,
+            corrections=self.corrections,
         )
 
     def headline(self) -> str:
@@ -199,6 +205,7 @@ class RefinedSurface:
         material_spec: shape of the material field.
         material_state: its parameters, refined from phase 1.
         environment: octahedral radiance.
+        corrections: how the views have to be read; None where that was not asked.
     """
 
     vertices: Float[Tensor, "N 3"]
@@ -206,6 +213,7 @@ class RefinedSurface:
     material_spec: MaterialFieldSpec
     material_state: dict[str, Tensor]
     environment: Float[Tensor, "M M 3"]
+    corrections: ViewCorrections | None = None
 
     def save(self, folder: Path) -> None:
         """Write one safetensors file and a readable spec."""
@@ -214,6 +222,7 @@ class RefinedSurface:
             "faces": self.faces,
             "environment": self.environment,
         }
+        tensors |= {} if self.corrections is None else self.corrections.tensors()
         tensors |= {f"material.{name}": value for name, value in self.material_state.items()}
         save_tensors(folder / "surface.safetensors", tensors)
         spec = {"materials": asdict(self.material_spec)}
@@ -228,6 +237,7 @@ class RefinedSurface:
             vertices=tensors.pop("vertices"),
             faces=tensors.pop("faces"),
             environment=tensors.pop("environment"),
+            corrections=ViewCorrections.taken_from(tensors),
             material_spec=MaterialFieldSpec(**spec["materials"]),
             material_state={name.removeprefix("material."): t for name, t in tensors.items()},
         )

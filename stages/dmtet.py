@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from stages import view_remedies
 from stages.artifacts import FittedField, MaterialViews, RefinedSurface
 from stages.base import Context, Stage
 from stages.errors import DivergenceError, InputError
@@ -32,6 +33,7 @@ from svim3d.mesh.tetrahedra import (
 )
 from svim3d.optim import NamedAdam, Rate
 from svim3d.render import ray_losses
+from svim3d.render.aligned_views import AlignedViews
 from svim3d.render.deferred import Geometry, RenderedView, environment_shader, render_mesh
 from svim3d.shading.prefilter import PyramidOperator
 
@@ -44,6 +46,7 @@ MIN_COVERAGE = 1e-3  # guards the division that turns premultiplied into straigh
 WARM_UP = 10  # steps over which the rates rise, while Adam's moments fill
 SIGN_CHANGE_SHARE = 0.25  # share of the steps over which its weight falls; Source: nvdiffrec
 SDF_EPS = 1e-8  # nodes that no view sees get gradients near zero and must stay where they are
+SPARSE = 3  # one in so many pixels of a view aligns it: enough, and a third of the time
 ENVIRONMENT_EPS = 1e-8  # texels that nothing reflects keep the light they started with
 
 
@@ -141,6 +144,7 @@ def _image_losses(
     straight = rendered.normal_world / rendered.mask.detach().clamp_min(MIN_COVERAGE)
     both = torch.minimum(rendered.mask.detach(), target["mask"])
     trust = target.get("confidence")
+    geometry_trust = ray_losses.combined_weight(trust, target.get(view_remedies.FACING))
     guide = ray_losses.smoothing_guide(target["radiance"], trust)
     return {
         "mask": config.mask_weight * ray_losses.squared_loss(rendered.mask, target["mask"], trust),
@@ -153,7 +157,7 @@ def _image_losses(
             trust,
         ),
         "normal": config.normal_weight
-        * ray_losses.absolute_loss(rendered.normal_world, target["normal_world"], trust),
+        * ray_losses.absolute_loss(rendered.normal_world, target["normal_world"], geometry_trust),
         "radiance": config.radiance_weight
         * ray_losses.radiance_loss(rendered.radiance, target["radiance"], trust),
         "normal_smoothness": config.normal_smoothness_weight
@@ -199,6 +203,7 @@ def _step_losses(
     operator: PyramidOperator,
     cameras: Cameras,
     planes: dict[str, Tensor],
+    aligned: AlignedViews | None,
     *,
     step: int,
     config: DmtetConfig,
@@ -223,14 +228,45 @@ def _step_losses(
             view=view,
             shader=shader,
         )
-        target = {name: plane[view] for name, plane in planes.items()}
+        if aligned is None:
+            target = {name: plane[view] for name, plane in planes.items()}
+        else:
+            target = _visit(aligned, view, rendered, step, config, ctx)
         for name, value in _image_losses(rendered, target, config).items():
             terms[name] = terms.get(name, 0.0) + value / config.views_per_step
     return terms
 
 
+def _visit(
+    aligned: AlignedViews,
+    view: int,
+    rendered: RenderedView,
+    step: int,
+    config: DmtetConfig,
+    ctx: Context,
+) -> dict[str, Tensor]:
+    """Targets of a view, read as fits it best so far; then its warp goes on."""
+    target, forgotten = aligned.chosen_targets(
+        view, rendered.basecolor.detach(), config.warp_patience
+    )
+    if forgotten:
+        ctx.event(
+            "warp_reset",
+            f"view {view} fits better without its homography, which begins anew at step {step}",
+        )
+    if step >= config.warp_start * config.steps:
+        aligned.observe_view(view, rendered.surface_images(), target, every=SPARSE)
+        aligned.update(config.warp_gain * config.final_rate ** (0.5 * step / config.steps))
+    return target
+
+
 def _optimise(
-    fit: _Fit, cameras: Cameras, planes: dict[str, Tensor], config: DmtetConfig, ctx: Context
+    fit: _Fit,
+    cameras: Cameras,
+    planes: dict[str, Tensor],
+    aligned: AlignedViews | None,
+    config: DmtetConfig,
+    ctx: Context,
 ) -> None:
     """The loop."""
     operator = cached_operator(ctx.shared, fit.environment.shape[0])
@@ -239,18 +275,26 @@ def _optimise(
     if saved is not None:
         first, tensors = saved
         fit.adam.load_state(tensors)
+        if aligned is not None:
+            aligned.load_state(tensors)
         log.info("dmtet: resumed at step %d", first)
     for step in range(first, config.steps):
         if ctx.checkpoints.due():
-            ctx.checkpoints.save(step, fit.adam.state())
-        terms = _step_losses(fit, operator, cameras, planes, step=step, config=config, ctx=ctx)
+            learnt = {} if aligned is None else aligned.state()
+            ctx.checkpoints.save(step, fit.adam.state() | learnt)
+        terms = _step_losses(
+            fit, operator, cameras, planes, aligned, step=step, config=config, ctx=ctx
+        )
         if ctx.is_finite(step, terms):
             fit.adam.zero_grad()
             torch.stack(list(terms.values())).sum().backward()
             if ctx.is_finite(step, fit.adam.gradients()):
                 warm = min(1.0, (step + 1) / WARM_UP)
                 fit.adam.step(config.final_rate ** (step / config.steps) * warm)
-        ctx.report(step + 1, config.steps, {name: float(t.detach()) for name, t in terms.items()})
+        told = {name: float(t.detach()) for name, t in terms.items()}
+        if aligned is not None:
+            told |= view_remedies.view_terms(aligned)
+        ctx.report(step + 1, config.steps, told)
 
 
 def run(
@@ -263,11 +307,16 @@ def run(
         DivergenceError: the surface vanished, or too many steps were not finite.
     """
     cameras, planes = views.premultiplied(config.image_size)
+    cameras = cameras.to(ctx.device)
     planes = {name: plane.to(ctx.device) for name, plane in planes.items()}
+    planes = view_remedies.with_facing_trust(cameras, planes, config)
+    aligned = view_remedies.align_views(cameras, planes, views.reference, config, field.corrections)
     lattice, start = _build_lattice(field, config, ctx.device)
     fit = _Fit.assemble(lattice, start, field, config)
     log.info("dmtet: %d nodes, %d tetrahedra", len(lattice.nodes), len(lattice.tetrahedra))
-    _optimise(fit, cameras.to(ctx.device), planes, config, ctx)
+    _optimise(fit, cameras, planes, aligned, config, ctx)
+    if aligned is not None:
+        view_remedies.tell_of_views(aligned, ctx)
     with torch.no_grad():
         vertices, faces, _ = fit.surface()
     return RefinedSurface(
@@ -276,6 +325,7 @@ def run(
         material_spec=fit.materials.spec,
         material_state={n: t.detach().cpu() for n, t in fit.materials.state_dict().items()},
         environment=fit.environment.detach().cpu(),
+        corrections=field.corrections if aligned is None else aligned.corrections.to("cpu"),
     )
 
 

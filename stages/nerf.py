@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from stages import view_remedies
 from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
 from stages.base import Context, Stage
 from stages.errors import InputError
@@ -25,6 +26,7 @@ from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
 from svim3d.fields.sdf_grid import resample_grid
 from svim3d.optim import NamedAdam, Rate
 from svim3d.render import ray_losses
+from svim3d.render.aligned_views import AlignedViews
 from svim3d.render.hull import INSIDE_COVERAGE, coverage_votes
 from svim3d.render.march import hits_surface
 from svim3d.render.pixel_blocks import PIXELS, PixelBlocks
@@ -234,6 +236,7 @@ def _losses(
     both = torch.minimum(blocks(rendered.mask).detach(), target["mask"])
     normal_weight = config.normal_weight + done * (config.normal_weight_end - config.normal_weight)
     trust = target.get("confidence")
+    geometry_trust = ray_losses.combined_weight(trust, target.get(view_remedies.FACING))
     terms = {
         "mask": config.mask_weight
         * ray_losses.mask_loss(blocks(rendered.mask), target["mask"], trust),
@@ -245,7 +248,8 @@ def _losses(
             torch.cat([target["roughness"], target["metallic"]], -1),
             trust,
         ),
-        "normal": normal_weight * ray_losses.absolute_loss(normal, target["normal_world"], trust),
+        "normal": normal_weight
+        * ray_losses.absolute_loss(normal, target["normal_world"], geometry_trust),
         "normal_smoothness": config.normal_smoothness_weight
         * ray_losses.bilateral_loss(straight, target["guide"], both),
         "depth_smoothness": config.depth_smoothness_weight
@@ -265,7 +269,7 @@ def _losses(
         )
     if done >= config.bump_start:
         terms["bump_normal"] = config.bump_normal_weight * ray_losses.absolute_loss(
-            blocks(rendered.normal_shading), target["normal_world"], trust
+            blocks(rendered.normal_shading), target["normal_world"], geometry_trust
         )
         terms["bump_size"] = config.bump_size_weight * ray_losses.size_loss(rendered.bump)
     return terms
@@ -280,19 +284,28 @@ def _draw(blocks: PixelBlocks, step: int, config: NerfConfig, ctx: Context) -> P
     return blocks.take(order[place * count : (place + 1) * count].to(ctx.device))
 
 
-def _optimise(fit: _Fit, blocks: PixelBlocks, config: NerfConfig, ctx: Context) -> None:
+def _optimise(
+    fit: _Fit, blocks: PixelBlocks, aligned: AlignedViews | None, config: NerfConfig, ctx: Context
+) -> None:
     """The loop. State is saved where the empty-space grid is a function of the parameters."""
     operator = cached_operator(ctx.shared, len(fit.log_environment))
-    first = _resume(fit, config, ctx)
+    first = _resume(fit, aligned, config, ctx)
     for step in range(first, config.steps):
+        warped = aligned if step >= config.warp_start * config.steps else None
         if step % REFRESH_EVERY == 0:
             _grow_if_due(fit, step, config)
+            if warped is not None:
+                view_remedies.realign(warped, step / config.steps, config)
             if ctx.checkpoints.due():
-                ctx.checkpoints.save(step, fit.adam.state() | dict(fit.volume.named_buffers()))
+                learnt = {} if aligned is None else aligned.state()
+                buffers = dict(fit.volume.named_buffers())
+                ctx.checkpoints.save(step, fit.adam.state() | buffers | learnt)
             if isinstance(fit.volume, SdfVolume):
                 fit.volume.sharpness = _sharpness_at(step / config.steps, config)
             fit.volume.refresh(generator=ctx.generator(f"refresh {step}"))
         batch = _draw(blocks, step, config, ctx)
+        if warped is not None:
+            batch = batch.showing(warped.targets(batch.pixels))
         jitter = torch.rand(batch.pixels.numel(), generator=ctx.generator(f"jitter {step}"))
         rendered = render_rays(
             fit.volume,
@@ -304,6 +317,8 @@ def _optimise(fit: _Fit, blocks: PixelBlocks, config: NerfConfig, ctx: Context) 
             use_bump=step >= config.bump_start * config.steps,
             multiple_scattering=config.multiple_scattering,
         )
+        if warped is not None:
+            warped.observe(batch.pixels, rendered.surface_images(), batch.targets)
         terms = _losses(rendered, batch, fit, step, config)
         if ctx.is_finite(step, terms):
             fit.adam.zero_grad()
@@ -311,7 +326,10 @@ def _optimise(fit: _Fit, blocks: PixelBlocks, config: NerfConfig, ctx: Context) 
             if ctx.is_finite(step, fit.adam.gradients()):
                 warm = min(1.0, (step + 1) / WARM_UP)
                 fit.adam.step(config.final_rate ** (step / config.steps) * warm)
-        ctx.report(step + 1, config.steps, {name: float(t.detach()) for name, t in terms.items()})
+        told = {name: float(t.detach()) for name, t in terms.items()}
+        if warped is not None and step % REFRESH_EVERY == 0:
+            told |= view_remedies.view_terms(warped)
+        ctx.report(step + 1, config.steps, told)
 
 
 def _grow_if_due(fit: _Fit, step: int, config: NerfConfig) -> None:
@@ -324,7 +342,7 @@ def _grow_if_due(fit: _Fit, step: int, config: NerfConfig) -> None:
         fit.grow(nodes, config)
 
 
-def _resume(fit: _Fit, config: NerfConfig, ctx: Context) -> int:
+def _resume(fit: _Fit, aligned: AlignedViews | None, config: NerfConfig, ctx: Context) -> int:
     """Take up a checkpoint; returns the step to go on with."""
     saved = ctx.checkpoints.load()
     if saved is None:
@@ -336,6 +354,8 @@ def _resume(fit: _Fit, config: NerfConfig, ctx: Context) -> int:
     fit.adam.load_state(tensors)
     for name, buffer in fit.volume.named_buffers():
         buffer.copy_(tensors[name])
+    if aligned is not None:
+        aligned.load_state(tensors)
     log.info("nerf: resumed at step %d", step)
     return step
 
@@ -358,9 +378,13 @@ def run(
     planes = {name: plane.to(ctx.device) for name, plane in planes.items()}
     hull = _hull(_silhouettes(planes), cameras, config, ctx)
     planes["guide"] = ray_losses.smoothing_guide(planes["radiance"], planes.get("confidence"))
+    planes = view_remedies.with_facing_trust(cameras, planes, config)
     blocks = _pixel_blocks(cameras, planes, hull, config)
     fit = _start(hull, environment, config, ctx)
-    _optimise(fit, blocks, config, ctx)
+    aligned = view_remedies.align_views(cameras, planes, views.reference, config)
+    _optimise(fit, blocks, aligned, config, ctx)
+    if aligned is not None:
+        view_remedies.tell_of_views(aligned, ctx)
     sdf = fit.volume.signed_distance(config.grid_nodes[-1])
     return FittedField(
         sdf=without_hidden_parts(sdf, smallest_share=SMALLEST_PART).cpu(),
@@ -368,6 +392,7 @@ def run(
         material_spec=fit.materials.spec,
         material_state={n: t.detach().cpu() for n, t in fit.materials.state_dict().items()},
         environment=fit.log_environment.detach().exp().cpu(),
+        corrections=None if aligned is None else aligned.corrections.to("cpu"),
     )
 
 

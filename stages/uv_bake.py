@@ -38,6 +38,7 @@ from svim3d.render.material_maps import BakedTexels, Wanted, material_maps
 from svim3d.render.occlusion import ambient_occlusion
 from svim3d.render.texture_fit import fit_texels, texel_view
 from svim3d.render.view_pixels import ViewPixels
+from svim3d.render.view_warps import ViewCorrections, read_through
 
 POINTS_PER_CHUNK = 2**17  # bounds the memory of the field's intermediate values
 # Steps of the fits by which forms are compared, at least: they begin at a constant, not at a bake.
@@ -90,7 +91,8 @@ def run(
         iterations=max(config.fit_iterations, JUDGED_ITERATIONS),
         sharpened=config.fit_iterations,
     )
-    pixels_at = cache(lambda size: _seen(mesh, size, views))
+    corrections = fitted.corrections if config.correct_views else None
+    pixels_at = cache(lambda size: _seen(mesh, size, views, corrections))
     if config.fit_iterations:
         fit = _sharpened(values[:, :5], texels, pixels_at(texels.size), config)
         values = torch.cat([fit, values[:, 5:]], 1)
@@ -226,20 +228,33 @@ def _baked_texels(mesh: TexturedMesh, values: Float[Tensor, "P 9"], texels: Texe
     )
 
 
-def _seen(mesh: TexturedMesh, texture_size: int, views: MaterialViews) -> ViewPixels:
+def _seen(
+    mesh: TexturedMesh,
+    texture_size: int,
+    views: MaterialViews,
+    corrections: ViewCorrections | None,
+) -> ViewPixels:
     """What the views say of basecolor, roughness and metallic, and how far it counts.
 
     Pixels at the rim of the mask are left out, slanted ones count by the cosine squared, all of
-    them by their confidence.
+    them by their confidence. Views are read through their warps, if they have any.
     """
     assert mesh.uv is not None
     seen = texel_view(mesh.vertices, mesh.faces, mesh.uv, views.cameras, texture_size=texture_size)
     images = torch.cat([views.basecolor, views.roughness, views.metallic, views.mask], -1)
-    target, mask = images.reshape(-1, 6)[seen.pixel].split([5, 1], 1)
-    weight = (mask >= SOLID) * seen.trust.clamp_min(0.0) ** 2
     if views.confidence is not None:
-        weight = weight * views.confidence.reshape(-1, 1)[seen.pixel]
+        images = torch.cat([images, views.confidence], -1)
+    flat = images.reshape(-1, images.shape[-1])
     count, height, width, _ = views.mask.shape
+    if corrections is None:
+        shown, vouched = flat[seen.pixel], None
+    else:
+        shown, vouched = read_through(corrections, flat, seen.pixel, height, width)
+    target, mask, confidence = shown.split([5, 1, shown.shape[1] - 6], 1)
+    weight = (mask >= SOLID) * seen.trust.clamp_min(0.0) ** 2
+    for further in (confidence, vouched):
+        if further is not None and further.shape[1]:
+            weight = weight * further
     return ViewPixels(
         operator=seen.operator,
         pixel=seen.pixel,

@@ -39,6 +39,7 @@ CONTRACT = (
     "stages.training_batches",
     "stages.precision",
     "stages.settings",
+    "stages.view_remedies",
 )
 MAY_IMPORT = {
     "svim3d": BASICS,
@@ -59,6 +60,7 @@ MAY_IMPORT = {
     "stages.store": ("stages.keys", "stages.manifest", "stages.errors"),
     "stages.locks": (),
     "stages.precision": ("stages.settings",),
+    "stages.view_remedies": ("svim3d", "stages.base", "stages.settings"),
     "stages.store_cleaning": ("stages.store", "stages.locks", "stages.errors"),
     "stages.store_archive": (
         "stages.store",

@@ -23,6 +23,20 @@ class DmtetConfig(StageConfig):
     reach: PositiveFloat = 2.0
     """Room for the surface to move, in cells; nodes farther from phase 1's are not kept."""
 
+    warp_start: Share = 0.0
+    """Share of the steps after which each view's homography goes on being fitted; 1: never."""
+    warp_limit: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.12
+    """Largest shift of a picture's corner by its homography, in half pictures."""
+    warp_gain: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
+    """Share of the missing shift by which a view's homography moves at each visit, at first."""
+    warp_patience: PositiveInt = 50
+    """Visits in a row at which a view fits better without its homography, until that begins anew
+    at the identity."""
+    weigh_views: bool = True
+    """Give less weight to views that disagree with all others; only with homographies."""
+    facing_gamma: NonNegativeFloat = 0.0
+    """Steepness of the trust in normals by the cosine that they are seen at; 0: all alike."""
+
     sdf_rate: NonNegativeFloat = 0.01
     """Adam step of the signed distance, in cells."""
     offset_rate: NonNegativeFloat = 0.01

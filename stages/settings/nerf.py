@@ -64,6 +64,21 @@ class NerfConfig(StageConfig):
     multiple_scattering: bool = True
     """Give back the energy that rough metals lose to single scattering (Fdez-Aguera 2019)."""
 
+    warp_start: Share = 0.1
+    """Share of the steps after which a homography is fitted to each view; 1: never. The paper
+    begins at one half."""
+    warp_limit: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.12
+    """Largest shift of a picture's corner by its homography, in half pictures."""
+    warp_gain: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
+    """Share of the missing shift by which a homography moves every eight steps, at first."""
+    warp_reach: Annotated[float, Field(ge=0.0, le=0.1)] = 0.02
+    """Distance over which a view's slope is taken when its homography is fitted, as a share of
+    the picture; it falls to one pixel."""
+    weigh_views: bool = True
+    """Give less weight to views that disagree with all others; only with homographies."""
+    facing_gamma: NonNegativeFloat = 0.0
+    """Steepness of the trust in normals by the cosine that they are seen at; 0: all alike."""
+
     field_rate: PositiveFloat = 1e-2
     """Adam step of the hash grids; Source: Mueller et al. 2022."""
     network_rate: PositiveFloat = 5e-3

@@ -65,6 +65,10 @@ class UvBakeConfig(StageConfig):
         le=1000,
         description="conjugate-gradient steps that sharpen the textures against the views; 0: none",
     )
+    correct_views: bool = Field(
+        default=True,
+        description="sharpen with the views' homographies and weights of earlier phases, if any",
+    )
     fit_prior: float = Field(
         default=0.015,
         gt=0.0,

@@ -111,6 +111,11 @@ class RenderedView:
     depth: Float[Tensor, "H W 1"]
     radiance: Float[Tensor, "H W 3"]
 
+    def surface_images(self) -> dict[str, Float[Tensor, "H W _"]]:
+        """Coverage, materials and shading normals by the names that they have in views."""
+        names = ("mask", "basecolor", "roughness", "metallic", "normal_world")
+        return {name: getattr(self, name) for name in names}
+
     def straight(self) -> "RenderedView":
         """The same images divided by coverage, normals of unit length; radiance as it is."""
         scale = torch.where(self.mask > MIN_COVERAGE, 1.0 / self.mask.clamp_min(MIN_COVERAGE), 0.0)

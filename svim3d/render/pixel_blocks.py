@@ -58,6 +58,10 @@ class PixelBlocks:
             {name: values[chosen] for name, values in self.targets.items()},
         )
 
+    def showing(self, targets: Mapping[str, Float[Tensor, "B 4 _"]]) -> "PixelBlocks":
+        """The same pixels with other values that they should show."""
+        return PixelBlocks(self.cameras, self.pixels, targets)
+
     def rays(self) -> Rays:
         """Rays through the pixels' centres, block after block."""
         flat = self.pixels.reshape(-1)

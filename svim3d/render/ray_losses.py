@@ -25,6 +25,15 @@ def _mean(values: Float[Tensor, "*batch C"], weight: Float[Tensor, "*batch 1"] |
     return values.mean() if weight is None else (weight * values).mean()
 
 
+def combined_weight(
+    first: Float[Tensor, "*batch 1"] | None, second: Float[Tensor, "*batch 1"] | None
+) -> Float[Tensor, "*batch 1"] | None:
+    """Product of two weights, of which either may be missing."""
+    if first is None or second is None:
+        return second if first is None else first
+    return first * second
+
+
 def tonemap(radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Logarithmic curve with T(0) = 0 and T(1) = 1, unbounded above."""
     return torch.log1p(TONE_CURVE * radiance.clamp_min(0.0)) / math.log1p(TONE_CURVE)

@@ -47,6 +47,16 @@ class Rendered:
     surface: SurfaceSamples
     bump: Float[Tensor, "M 3"]
 
+    def surface_images(self) -> dict[str, Float[Tensor, "R _"]]:
+        """Coverage, materials and geometric normals by the names that they have in views."""
+        return {
+            "mask": self.mask,
+            "basecolor": self.basecolor,
+            "roughness": self.roughness,
+            "metallic": self.metallic,
+            "normal_world": self.normal_geometric,
+        }
+
 
 def render_rays(
     volume: Volume,

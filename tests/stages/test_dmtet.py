@@ -1,5 +1,6 @@
 """Phase 2 on an analytic sphere: mends a wrong start, resumes to the byte, refuses no surface."""
 
+import dataclasses
 import math
 
 import pytest
@@ -15,6 +16,7 @@ from stages.settings.dmtet import DmtetConfig
 from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
 from svim3d.fields.sdf_grid import node_positions
 from svim3d.mesh.mesh import face_adjacency, signed_volume
+from svim3d.render.view_warps import ViewCorrections
 
 CONFIG = DmtetConfig(
     steps=60,
@@ -101,6 +103,47 @@ def test_sure_pixels_change_no_bit_and_doubtful_ones_teach_nothing(views, field,
     assert equal(refined(spoilt(views)), refined(warned(views)))
     blind = MaterialViews(**vars(spoilt(views)) | {"confidence": None})
     assert not equal(refined(blind), refined(warned(views)))
+
+
+def shifted(views: MaterialViews, view: int, columns: int) -> MaterialViews:
+    """The same views, one of them moved to the right by whole pixels."""
+    names = ("radiance", "mask", "basecolor", "roughness", "metallic", "normal_world")
+    images = {name: getattr(views, name).clone() for name in names}
+    for image in images.values():
+        image[view] = image[view].roll(columns, dims=1)
+    return MaterialViews(**vars(views) | images)
+
+
+def test_a_moved_view_is_found_and_read_where_it_is(views, field, make_context):
+    first = DMTET.run(views, field, config=CONFIG, ctx=make_context("first"))
+    p = node_positions(33, HALF_EXTENT, like=torch.zeros(()))
+    good = dataclasses.replace(
+        field, sdf=RADIUS - p.norm(dim=-1), material_state=first.material_state
+    )
+    config = CONFIG.model_copy(update={"steps": 30})
+    moved = shifted(views, 2, 2)
+    refined = DMTET.run(moved, good, config=config, ctx=make_context("dmtet"))
+    assert refined.corrections is not None
+    across = refined.corrections.shifts[..., 0].mean(1) * 64 / 2
+    # Of six views one has much in common with all: they share in its way back.
+    others = across[[0, 1, 3, 4, 5]]
+    assert float(across[2] - others.mean()) == pytest.approx(2.0, abs=0.8)
+    off = config.model_copy(update={"warp_start": 1.0})
+    assert DMTET.run(views, field, config=off, ctx=make_context("dmtet")).corrections is None
+
+
+def test_a_warp_that_never_fits_begins_anew_and_is_told(views, field, make_context):
+    """Phase 1 was wrong about one view: its albedo fits better as it is."""
+    shifts = torch.zeros(6, 4, 2)
+    shifts[2, :, 0] = 0.11
+    wrong = dataclasses.replace(field, corrections=ViewCorrections(shifts, torch.ones(6)))
+    config = CONFIG.model_copy(update={"steps": 12, "warp_patience": 2, "warp_gain": 0.01})
+    ctx = make_context("dmtet")
+    refined = DMTET.run(views, wrong, config=config, ctx=ctx)
+    assert {event["kind"] for event in ctx.events} == {"warp_reset"}
+    told = [event["message"] for event in ctx.events]
+    assert any("view 2 fits better without its homography" in message for message in told)
+    assert float(refined.corrections.shifts[2].abs().max()) < 0.05
 
 
 def test_a_killed_run_resumes_to_the_same_bytes(views, field, make_context, monkeypatch):

@@ -14,6 +14,7 @@ from stages.settings.nerf import NerfConfig
 from svim3d.fields.material_field import MaterialField
 from svim3d.fields.sdf_grid import node_positions, sample_sdf
 from svim3d.numerics import normalize
+from svim3d.render.view_warps import homographies
 
 TINY = NerfConfig(
     steps=60,
@@ -166,6 +167,66 @@ def only(views, chosen):
         if f.name not in ("cameras", "reference", "depth", "confidence")
     }
     return MaterialViews(cameras=views.cameras[chosen], reference=0, **images)
+
+
+def shifted(views, view, columns):
+    """The same views, one of them moved to the right by whole pixels."""
+    names = ("radiance", "mask", "basecolor", "roughness", "metallic", "normal_world")
+    images = {name: getattr(views, name).clone() for name in names}
+    for image in images.values():
+        image[view] = image[view].roll(columns, dims=1)
+    return dataclasses.replace(views, **images)
+
+
+def test_a_moved_view_is_found_and_the_artifact_says_so(views, make_context, tmp_path):
+    config = TINY.model_copy(update={"hull_rejections": 1, "steps": 120})
+    fitted = run(shifted(views, 2, 2), None, config=config, ctx=make_context("nerf"))
+    across = fitted.corrections.shifts[..., 0].mean(1) * 48 / 2
+    # Some of it moves the object: there are few views, and a sphere shows little.
+    assert float(across[2]) == pytest.approx(1.5, abs=0.6)
+    others = [view for view in range(9) if view != 2]
+    assert float(across[others].abs().max()) < 0.7
+    fitted.save(tmp_path)
+    again = FittedField.load(tmp_path)
+    assert torch.equal(again.corrections.shifts, fitted.corrections.shifts)
+    assert torch.equal(again.corrections.weights, fitted.corrections.weights)
+    assert again.own_surface().corrections is again.corrections
+    off = TINY.model_copy(update={"steps": 2, "warp_start": 1.0})
+    assert run(views, None, config=off, ctx=make_context("nerf")).corrections is None
+
+
+def test_plain_views_do_not_drift(views, make_context):
+    """Without any texture a warp could go anywhere; true views keep theirs within bounds."""
+    plain = views.mask.expand(-1, -1, -1, 3) * 0.5
+    bare = dataclasses.replace(views, basecolor=plain, radiance=plain)
+    shifts = run(bare, None, config=TINY, ctx=make_context("nerf")).corrections.shifts
+    # 5 % of the picture is a tenth of its half.
+    assert float(shifts.norm(dim=-1).max()) < 0.1
+    assert bool((torch.linalg.det(homographies(shifts)) > 0).all())
+
+
+def test_trust_by_angle_changes_normals_alone(views, make_context):
+    config = TINY.model_copy(update={"steps": 4})
+    kept = run(views, None, config=config, ctx=make_context("nerf"))
+    facing = config.model_copy(update={"facing_gamma": 1.0})
+    assert not equal(run(views, None, config=facing, ctx=make_context("nerf")), kept)
+    blind = {"normal_weight": 0.0, "normal_weight_end": 0.0}
+    pair = [
+        run(views, None, config=c.model_copy(update=blind), ctx=make_context("nerf"))
+        for c in (config, facing)
+    ]
+    # Step 2 of 4 fits the bump, whose target is a normal too.
+    assert not equal(*pair)
+    pair = [
+        run(
+            views,
+            None,
+            config=c.model_copy(update=blind | {"bump_normal_weight": 0.0}),
+            ctx=make_context("nerf"),
+        )
+        for c in (config, facing)
+    ]
+    assert equal(*pair)
 
 
 def test_one_view_is_refused_with_advice(views, make_context):

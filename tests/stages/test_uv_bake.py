@@ -18,6 +18,7 @@ from svim3d.mesh.frames import bitangents, world_from_tangent
 from svim3d.mesh.mesh import face_normals_scaled
 from svim3d.numerics import dot, normalize
 from svim3d.raster.texture import sample_texture
+from svim3d.render.view_warps import ViewCorrections, inverse_shifts, read_through
 
 RADIUS, HALF = 0.4, 0.55
 SPEC = MaterialFieldSpec(levels=3, log2_entries=12, coarsest=4, finest=12, hidden=8)
@@ -194,6 +195,56 @@ def test_textures_are_sharpened_by_what_can_be_trusted(ctx):
     hidden = textures(spoilt(VIEWS))
     assert torch.equal(hidden, textures(warned(VIEWS)))
     assert not torch.equal(hidden, plain)
+
+
+def moved(views, shifts):
+    """Views whose content lies where the warps put it."""
+    size = views.cameras.height
+    pixels = torch.arange(views.mask.numel())
+    back = ViewCorrections(inverse_shifts(shifts), torch.ones(len(shifts)))
+    images = {
+        n: getattr(views, n) for n in ("radiance", "mask", "basecolor", "roughness", "metallic")
+    }
+    return dataclasses.replace(
+        views,
+        **{
+            name: read_through(back, image.flatten(0, 2), pixels, size, size)[0].view(image.shape)
+            for name, image in images.items()
+        },
+    )
+
+
+def test_views_are_read_through_their_warps(ctx):
+    """Stripes of moved views are sharp only where the warps are undone."""
+    config = TINY.model_copy(update={"fit_iterations": 20, "texture_size": 256})
+    shifts = 0.06 * torch.randn(5, 4, 2, generator=torch.Generator().manual_seed(0))
+    views = moved(VIEWS, shifts)
+    field = dataclasses.replace(
+        sphere_field(bump=0.0), corrections=ViewCorrections(shifts, torch.ones(5))
+    )
+
+    def error(config):
+        mesh = run(views, field, None, config=config, ctx=ctx)
+        at = surface_samples(mesh)
+        height = at(mesh.vertices)[:, 1:2]
+        found = sample_texture(mesh.basecolor, at(mesh.uv))[:, :1]
+        truth = 0.5 + 0.4 * torch.sin(60.0 * height)
+        return float((found - truth).abs()[height.abs() < 0.25].mean())
+
+    assert error(config) < 0.12
+    assert error(config.model_copy(update={"correct_views": False})) > 0.2
+
+
+def test_a_view_without_weight_paints_nothing(ctx):
+    config = TINY.model_copy(update={"fit_iterations": 3})
+    wrong = dataclasses.replace(VIEWS, basecolor=VIEWS.basecolor.clone())
+    wrong.basecolor[1] = 1.0 - wrong.basecolor[1]
+    weights = torch.ones(5)
+    weights[1] = 0.0
+    corrections = ViewCorrections(torch.zeros(5, 4, 2), weights)
+    field = dataclasses.replace(sphere_field(bump=0.0), corrections=corrections)
+    right = run(VIEWS, field, None, config=config, ctx=ctx)
+    assert torch.equal(run(wrong, field, None, config=config, ctx=ctx).basecolor, right.basecolor)
 
 
 def test_an_empty_surface_is_an_input_error(ctx):

@@ -1,0 +1,71 @@
+"""What is told of views: who was outvoted, whose warp ran into its bound, figures in pixels."""
+
+import pytest
+import torch
+from sphere_orbit import sphere_cameras, sphere_images
+
+from stages import view_remedies
+from stages.artifacts import MaterialViews
+from stages.settings.dmtet import DmtetConfig
+from stages.settings.nerf import NerfConfig
+from svim3d.render.view_warps import ViewCorrections
+
+CAMERAS = sphere_cameras(views=4, size=16)
+VIEWS = MaterialViews(cameras=CAMERAS, reference=3, **sphere_images(CAMERAS))
+_, PLANES = VIEWS.premultiplied(16)
+
+
+def aligned(shifts, weights, config=None):
+    start = ViewCorrections(shifts, weights)
+    return view_remedies.align_views(CAMERAS, PLANES, 3, config or NerfConfig(), start)
+
+
+def test_outvoted_views_and_bound_warps_are_named(make_context):
+    shifts = torch.zeros(4, 4, 2)
+    shifts[1, 2, 0] = NerfConfig().warp_limit
+    ctx = make_context("nerf")
+    view_remedies.tell_of_views(aligned(shifts, torch.tensor([1.0, 1.0, 0.25, 1.0])), ctx)
+    told = {event["kind"]: event["message"] for event in ctx.events}
+    assert told == {
+        "view_outvoted": "view 2 disagrees with the others: it counts 0.25",
+        "warp_bound": "the homographies of views [1] have reached their bound",
+    }
+
+
+def test_views_that_agree_are_not_mentioned(make_context):
+    ctx = make_context("nerf")
+    view_remedies.tell_of_views(aligned(torch.zeros(4, 4, 2), torch.ones(4)), ctx)
+    assert ctx.events == []
+
+
+def test_figures_are_in_pixels():
+    shifts = torch.zeros(4, 4, 2)
+    shifts[0] = torch.tensor([3.0, 4.0]) / 100
+    terms = view_remedies.view_terms(aligned(shifts, torch.tensor([1.0, 0.5, 1.0, 1.0])))
+    # Five hundredths of half of 16 pixels, of one view in four.
+    assert terms == pytest.approx(
+        {"warp_px": 0.1, "largest_warp_px": 0.4, "least_view_weight": 0.5}
+    )
+
+
+@pytest.mark.parametrize("kind", [NerfConfig, DmtetConfig])
+def test_switched_off_they_leave_everything_as_it_is(kind):
+    config = kind(warp_start=1.0, facing_gamma=0.0)
+    assert aligned(torch.zeros(4, 4, 2), torch.ones(4), config) is None
+    assert view_remedies.with_facing_trust(CAMERAS, PLANES, config) is PLANES
+
+
+def test_trust_by_angle_is_a_plane_beside_the_others():
+    found = view_remedies.with_facing_trust(CAMERAS, PLANES, NerfConfig(facing_gamma=2.0))
+    assert set(found) - set(PLANES) == {view_remedies.FACING}
+    assert found[view_remedies.FACING].shape == VIEWS.mask.shape
+    assert all(found[name] is plane for name, plane in PLANES.items())
+
+
+def test_phase_1_aligns_in_ever_finer_steps():
+    views = aligned(torch.zeros(4, 4, 2), torch.ones(4))
+    config = NerfConfig(warp_reach=0.1)
+    view_remedies.realign(views, 0.0, config)
+    assert views.alignment.reach_px == pytest.approx(1.6)
+    view_remedies.realign(views, 0.9, config)
+    assert views.alignment.reach_px == 1.0
