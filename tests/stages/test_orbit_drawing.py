@@ -31,7 +31,7 @@ def folder(tmp_path_factory):
 def perfect(monkeypatch):
     """The tiny model decodes whatever it draws to the sphere, a little brighter or darker."""
 
-    def decode(self, latents, sampling):
+    def decode(self, latents, sampling, conditioning):
         sphere = drawn_sphere(VIEWS, SIZE)
         # Far digits of the latents: as good as random, and the same for the same seed.
         shade = 1.0 - 0.3 * (1000.0 * latents[0, 0, 0, 0]).remainder(1.0)
@@ -130,7 +130,7 @@ def test_of_several_samples_one_is_kept_with_its_confidence(perfect, draw, make_
 
 
 def test_views_without_an_object_are_refused_with_advice(draw, monkeypatch):
-    def decode(self, latents, sampling):
+    def decode(self, latents, sampling, conditioning):
         sphere = drawn_sphere(VIEWS, SIZE)
         return replace(sphere, mask=torch.ones_like(sphere.mask))
 
