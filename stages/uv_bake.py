@@ -23,12 +23,7 @@ from stages.errors import InputError
 from stages.settings.uv_bake import UvBakeConfig
 from svim3d.mesh.atlas import unwrap
 from svim3d.mesh.cleanup import CleanMesh, clean_surface, decimate
-from svim3d.mesh.frames import (
-    bitangents,
-    tangent_frames,
-    tangent_from_world,
-    world_from_tangent,
-)
+from svim3d.mesh.frames import tangent_frames, tangent_from_world
 from svim3d.mesh.mesh import vertex_normals
 from svim3d.mesh.projection import project_onto
 from svim3d.mesh.texels import Texels, average_down, rasterize_uv, to_image
@@ -96,7 +91,8 @@ def run(
     if config.fit_iterations:
         fit = _sharpened(values[:, :5], texels, pixels_at(texels.size), config)
         values = torch.cat([fit, values[:, 5:]], 1)
-    baked = _baked_texels(mesh, values, texels)
+    surface_values, local, occlusion = values.split([5, 3, 1], 1)
+    baked = BakedTexels(surface_values, occlusion, local, mesh, texels)
     maps = material_maps(baked, pixels_at, views.normal_world, wanted)
     for name, note in maps.notes.items():
         ctx.event("material", f"{name}: {note}", tell=False)
@@ -180,15 +176,7 @@ def _bake(
 
     The shading normal is that of the field: geometric normal of the fine surface plus bump.
     """
-    assert mesh.tangents is not None
-    normal, tangent, bitangent = (
-        texels.interpolate(mesh.faces, attribute)
-        for attribute in (
-            mesh.normals,
-            mesh.tangents[:, :3].contiguous(),
-            bitangents(mesh.normals, mesh.tangents),
-        )
-    )
+    normal, tangent, bitangent = mesh.frame(texels)
     points = texels.interpolate(mesh.faces, mesh.vertices)
     hits = project_onto(points, normal, fine.vertices, fine.faces)
     points = hits.interpolate(fine.faces, fine.vertices)
@@ -204,28 +192,6 @@ def _bake(
             surface = torch.cat([found.basecolor, found.roughness, found.metallic], 1).cpu()
             chunks.append(torch.cat([surface, local], 1))
     return torch.cat(chunks)
-
-
-def _baked_texels(mesh: TexturedMesh, values: Float[Tensor, "P 9"], texels: Texels) -> BakedTexels:
-    """The finished texels, with the normals that a viewer would see with and without the map."""
-    assert mesh.tangents is not None
-    local = normalize(values[:, 5:8])
-    normal, tangent, bitangent = (
-        texels.interpolate(mesh.faces, attribute)
-        for attribute in (
-            mesh.normals,
-            mesh.tangents[:, :3].contiguous(),
-            bitangents(mesh.normals, mesh.tangents),
-        )
-    )
-    return BakedTexels(
-        surface=values[:, :5],
-        occlusion=values[:, 8:],
-        local=values[:, 5:8],
-        flat=normalize(normal),
-        mapped=world_from_tangent(local, normal, tangent, bitangent),
-        texels=texels,
-    )
 
 
 def _seen(

@@ -7,6 +7,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from svim3d.mesh.frames import bitangents
+from svim3d.mesh.texels import Texels
+
 
 @dataclass(frozen=True)
 class PaintedMesh:
@@ -43,6 +46,20 @@ class PaintedMesh:
         """Those of its maps that are pictures."""
         maps = {"basecolor": self.basecolor, "orm": self.orm, "normal": self.normal_tangent}
         return {name: m for name, m in maps.items() if m is not None and m.ndim == 3}
+
+    @property
+    def axes(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+        """Normal, tangent and bitangent at vertices."""
+        assert self.tangents is not None
+        across = bitangents(self.normals, self.tangents)
+        return self.normals, self.tangents[:, :3].contiguous(), across
+
+    def frame(
+        self, texels: Texels
+    ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+        """Normal, tangent and bitangent at texels, as interpolated."""
+        normal, tangent, bitangent = (texels.interpolate(self.faces, axis) for axis in self.axes)
+        return normal, tangent, bitangent
 
     def without_needless_seams(self) -> Self:
         """The same without tangents or texture coordinates where no map needs them.

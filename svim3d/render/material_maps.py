@@ -9,6 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from svim3d.color import srgb_from_linear
+from svim3d.mesh.frames import world_from_tangent
+from svim3d.mesh.painted_mesh import PaintedMesh
 from svim3d.mesh.texels import Texels, average_down, fill_empty, to_image
 from svim3d.numerics import normalize
 from svim3d.render.material_evidence import (
@@ -41,17 +43,21 @@ class BakedTexels:
         surface: basecolor (linear), roughness and metallic.
         occlusion: share of the sky that is seen.
         local: shading normals in tangent space.
-        flat: shading normals without a normal map, world frame.
-        mapped: those with it.
+        mesh: whose texels they are, with tangents.
         texels: where they lie.
     """
 
     surface: Float[Tensor, "P 5"]
     occlusion: Float[Tensor, "P 1"]
     local: Float[Tensor, "P 3"]
-    flat: Float[Tensor, "P 3"]
-    mapped: Float[Tensor, "P 3"]
+    mesh: PaintedMesh
     texels: Texels
+
+    def world_normals(self) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+        """Shading normals that a viewer sees without the normal map, and those with it."""
+        normal, tangent, bitangent = self.mesh.frame(self.texels)
+        mapped = world_from_tangent(normalize(self.local), normal, tangent, bitangent)
+        return normalize(normal), mapped
 
 
 @dataclass(frozen=True)
@@ -280,7 +286,7 @@ class _Maker:
         target = normalize(self._normals.reshape(-1, 3)[pixels.pixel])
         weight = pixels.weight.double()
         residual = torch.zeros_like(target)
-        for name, world in (("mesh", self._baked.flat), ("map", self._baked.mapped)):
+        for name, world in zip(("mesh", "map"), self._baked.world_normals(), strict=True):
             image = to_image(world, self._baked.texels).reshape(-1, 3)
             residual = normalize(pixels.operator(image)) - target
             squared = (weight * residual.square().sum(1, keepdim=True)).sum()

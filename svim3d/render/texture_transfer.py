@@ -8,16 +8,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from svim3d.mesh.atlas import unwrap
-from svim3d.mesh.frames import (
-    bitangents,
-    tangent_frames,
-    tangent_from_world,
-    world_from_tangent,
-)
+from svim3d.mesh.frames import tangent_frames, tangent_from_world, world_from_tangent
 from svim3d.mesh.mesh import vertex_normals
 from svim3d.mesh.painted_mesh import PaintedMesh
 from svim3d.mesh.projection import SurfaceHits, project_onto
-from svim3d.mesh.texels import Texels, rasterize_uv, to_image
+from svim3d.mesh.texels import rasterize_uv, to_image
 from svim3d.numerics import normalize
 from svim3d.raster.texture import sample_texture
 
@@ -84,27 +79,12 @@ def _repainted(
     uv = old.at(hits, old.mesh.uv)
     if name == "normal":
         world = world_from_tangent(sample_texture(image, uv), *old.frame(hits))
-        return normalize(to_image(tangent_from_world(world, *_frame(texels, new)), texels))
+        return normalize(to_image(tangent_from_world(world, *new.frame(texels)), texels))
     if len(torch.unique(image.reshape(-1, 3), dim=0)) <= FEW_COLOURS:
         size = len(image)
         column, row = (uv * size).long().clamp(0, size - 1).unbind(1)
         return to_image(image[row, column], texels)
     return to_image(sample_texture(image, uv), texels)
-
-
-def _frame(texels: Texels, mesh: PaintedMesh) -> tuple[Tensor, Tensor, Tensor]:
-    """Normal, tangent and bitangent at texels."""
-    normal, tangent, bitangent = (
-        texels.interpolate(mesh.faces, attribute) for attribute in _axes(mesh)
-    )
-    return normal, tangent, bitangent
-
-
-def _axes(mesh: PaintedMesh) -> tuple[Tensor, Tensor, Tensor]:
-    """Normal, tangent and bitangent at vertices."""
-    assert mesh.tangents is not None
-    across = bitangents(mesh.normals, mesh.tangents)
-    return mesh.normals, mesh.tangents[:, :3].contiguous(), across
 
 
 class _Source:
@@ -139,5 +119,5 @@ class _Source:
 
     def frame(self, hits: SurfaceHits) -> tuple[Tensor, Tensor, Tensor]:
         """Normal, tangent and bitangent there."""
-        normal, tangent, bitangent = (self.at(hits, axis) for axis in _axes(self.mesh))
+        normal, tangent, bitangent = (self.at(hits, axis) for axis in self.mesh.axes)
         return normal, tangent, bitangent
