@@ -91,7 +91,7 @@ def _examine(subject: Subject, number: int, where: str) -> Kill:
     kill.harm = harm_in(subject.store, subject)
     if code is None:
         kill.harm.append(f"did not stop within {STOP_S:.0f} s")
-    if number == signal.SIGTERM and code not in (None, 130, -signal.SIGTERM):
+    if number == signal.SIGTERM and code not in (None, 0, 130, -signal.SIGTERM):
         kill.harm.append(f"ended with code {code}: {subject.said()}")
     kill.steps = checkpoint_steps(subject.store)
     kill.lost_cpu_s = subject.cpu_s - subject.kept_cpu_s

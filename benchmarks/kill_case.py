@@ -17,7 +17,15 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from flows.pipeline import IMAGE_TO_ASSET  # noqa: E402
-from flows.run_records import CANCELLED, COMPUTING, DIED, WAITING, RunIndex, RunRecord  # noqa: E402
+from flows.run_records import (  # noqa: E402
+    CANCELLED,
+    COMPUTING,
+    DIED,
+    DONE,
+    WAITING,
+    RunIndex,
+    RunRecord,
+)
 from stages.locks import is_locked  # noqa: E402
 from stages.store import Store  # noqa: E402
 from svim3d.io.weights import open_tensors  # noqa: E402
@@ -316,8 +324,10 @@ def harm_in(store: Path, subject: Subject) -> list[str]:
             harm.append(f"artifact {key[:8]}: {health.damage}")
     locks = [*(store / "lock").glob("*"), store / "lease"]
     harm += [f"lock {file.name[:8]} is held" for file in locks if is_locked(file)]
+    # A signal that comes once all is published finds a run that is done, and says so.
+    ends = (DONE,) if subject.process.poll() == 0 else (DIED, CANCELLED)
     record = subject.record()
-    if record is not None and record.now not in (DIED, CANCELLED):
+    if record is not None and record.now not in ends:
         harm.append(f"shown as {record.now}")
     return harm
 
