@@ -17,6 +17,7 @@ from stages import view_remedies
 from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
 from stages.base import Context, Stage
 from stages.errors import InputError
+from stages.nerf_terms import ray_terms
 from stages.prefilter_cache import cached_operator
 from stages.settings.nerf import NerfConfig
 from svim3d.cameras import Cameras
@@ -31,13 +32,12 @@ from svim3d.render.hull import INSIDE_COVERAGE, coverage_votes
 from svim3d.render.march import hits_surface
 from svim3d.render.pixel_blocks import PIXELS, PixelBlocks
 from svim3d.render.volumes import DensityVolume, SdfVolume
-from svim3d.render.volumetric import Rendered, render_rays
+from svim3d.render.volumetric import render_rays
 
 log = logging.getLogger(__name__)
 
 VOLUME, SDF_GRID, ENVIRONMENT = "volume.", "volume.grid", "log_environment"  # parameter names
 
-MIN_COVERAGE = 1e-3  # guards the division that turns premultiplied into straight
 MIN_VIEWS = 3  # fewer silhouettes leave the hull open along whole directions
 ENVIRONMENT_EPS = 1e-8  # texels that nothing reflects keep the light they started with
 HULL_NODES = 128  # fine enough for parts of one pixel, and still computed in half a second
@@ -220,61 +220,6 @@ def _start(
     return _Fit.assemble(volume, materials.to(ctx.device), log_environment, config)
 
 
-def _losses(
-    rendered: Rendered, batch: PixelBlocks, fit: _Fit, step: int, config: NerfConfig
-) -> dict[str, Tensor]:
-    """Weighted loss terms of one batch."""
-    target = batch.targets
-    done = step / config.steps
-
-    def blocks(values: Tensor) -> Tensor:
-        return values.view(-1, PIXELS, values.shape[-1])
-
-    normal = blocks(rendered.normal_geometric)
-    straight = normal / blocks(rendered.mask).clamp_min(MIN_COVERAGE)
-    depth = blocks(rendered.depth) / blocks(rendered.mask).clamp_min(MIN_COVERAGE)
-    both = torch.minimum(blocks(rendered.mask).detach(), target["mask"])
-    normal_weight = config.normal_weight + done * (config.normal_weight_end - config.normal_weight)
-    trust = target.get("confidence")
-    geometry_trust = ray_losses.combined_weight(trust, target.get(view_remedies.FACING))
-    terms = {
-        "mask": config.mask_weight
-        * ray_losses.mask_loss(blocks(rendered.mask), target["mask"], trust),
-        "basecolor": config.basecolor_weight
-        * ray_losses.color_loss(blocks(rendered.basecolor), target["basecolor"], trust),
-        "orm": config.orm_weight
-        * ray_losses.squared_loss(
-            torch.cat([blocks(rendered.roughness), blocks(rendered.metallic)], -1),
-            torch.cat([target["roughness"], target["metallic"]], -1),
-            trust,
-        ),
-        "normal": normal_weight
-        * ray_losses.absolute_loss(normal, target["normal_world"], geometry_trust),
-        "normal_smoothness": config.normal_smoothness_weight
-        * ray_losses.bilateral_loss(straight, target["guide"], both),
-        "depth_smoothness": config.depth_smoothness_weight
-        * ray_losses.depth_smoothness_loss(depth, both, batch.footprint),
-    }
-    if isinstance(fit.volume, SdfVolume):
-        terms["eikonal"] = config.eikonal_weight * ray_losses.unit_gradient_loss(
-            rendered.surface.gradient
-        )
-    if rendered.radiance is not None:
-        terms["radiance"] = config.radiance_weight * ray_losses.radiance_loss(
-            blocks(rendered.radiance), target["radiance"], trust
-        )
-        light = fit.log_environment.exp()
-        terms["light_balance"] = (
-            config.light_balance_weight * (light - light.mean(-1, keepdim=True)).abs().mean()
-        )
-    if done >= config.bump_start:
-        terms["bump_normal"] = config.bump_normal_weight * ray_losses.absolute_loss(
-            blocks(rendered.normal_shading), target["normal_world"], geometry_trust
-        )
-        terms["bump_size"] = config.bump_size_weight * ray_losses.size_loss(rendered.bump)
-    return terms
-
-
 def _draw(blocks: PixelBlocks, step: int, config: NerfConfig, ctx: Context) -> PixelBlocks:
     """The blocks of a step: epochs of random order, each a function of the seed alone."""
     count = min(config.rays_per_step // PIXELS, len(blocks))
@@ -319,7 +264,13 @@ def _optimise(
         )
         if warped is not None:
             warped.observe(batch.pixels, rendered.surface_images(), batch.targets)
-        terms = _losses(rendered, batch, fit, step, config)
+        terms = ray_terms(
+            rendered,
+            batch,
+            log_environment=fit.log_environment,
+            done=step / config.steps,
+            config=config,
+        )
         if ctx.is_finite(step, terms):
             fit.adam.zero_grad()
             torch.stack(list(terms.values())).sum().backward()
