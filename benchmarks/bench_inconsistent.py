@@ -134,7 +134,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--rows", nargs="+", help="names of rows; all if none is named")
     parser.add_argument("--row", nargs="+", action="append", default=[], help="NAME SETTING...")
     parser.add_argument("--set", action="append", default=[], dest="overrides")
-    parser.add_argument("--baseline", default="plain", help="row that differences are taken to")
+    parser.add_argument(
+        "--baseline", default="full, as in the paper", help="row that differences are taken to"
+    )
     parser.add_argument("--timeout", type=float, default=CASE_TIMEOUT_S, help="of a case, s")
     parser.add_argument("--keep", action="store_true", help="keep results of other code as well")
     parser.add_argument(

@@ -83,7 +83,7 @@ def given(data, *arguments):
 
 
 def test_rows_of_the_command_line_join_the_table(data, capsys):
-    asked = given(data, "--row", "longer", "nerf.steps=300", "--rows", "plain", "longer")
+    asked = given(data, "--row", "longer", "nerf.steps=300", "--rows", "ours", "longer")
     assert asked.table["longer"] == ("nerf.steps=300",)
     for wrong in (["--rows", "lain"], ["--row", "x", "nerf.stepz=3"]):
         with pytest.raises(SystemExit):
@@ -92,7 +92,7 @@ def test_rows_of_the_command_line_join_the_table(data, capsys):
 
 
 def test_severity_zero_is_run_with_one_seed(data):
-    asked = given(data, "--severities", "0", "3", "--seeds", "4", "5", "--rows", "plain")
+    asked = given(data, "--severities", "0", "3", "--seeds", "4", "5", "--rows", "ours")
     assert [(c.severity, c.seed) for c in cases(asked)] == [(0.0, 4), (3.0, 4), (3.0, 5)]
 
 
@@ -129,7 +129,7 @@ def result_key(command):
 
 
 def test_finished_cases_are_not_run_again_and_failed_ones_are(data, monkeypatch):
-    asked = given(data, "--severities", "3", "--seeds", "0", "--rows", "plain")
+    asked = given(data, "--severities", "3", "--seeds", "0", "--rows", "ours")
     (case,) = cases(asked)
     known = {}
     figures = {"outcome": ASSET, "figures": {"view_db": 20.0}}
@@ -140,7 +140,7 @@ def test_finished_cases_are_not_run_again_and_failed_ones_are(data, monkeypatch)
         assert len(ran) == runs
     # Other settings are another case, unless told to keep.
     other = given(
-        data, "--severities", "3", "--seeds", "0", "--rows", "plain", "--set", "nerf.steps=9"
+        data, "--severities", "3", "--seeds", "0", "--rows", "ours", "--set", "nerf.steps=9"
     )
     scripted(monkeypatch, [CRASHED])
     assert bench_inconsistent.run_case(case, other, known)["outcome"] == CRASHED
@@ -152,11 +152,11 @@ def some_results():
     results = Results()
     for orbit, level in (("a", 20.0), ("b", 30.0)):
         for seed in range(3):
-            for row, gain in (("plain", 0.0), ("better", 2.0)):
+            for row, gain in (("ours", 0.0), ("better", 2.0)):
                 value = level + gain + 0.1 * seed
                 figures = {"view_db": value, "normal_deg": 5.0 - gain}
                 results.add(Case(orbit, 3.0, seed, row), {"outcome": ASSET, "figures": figures})
-    results.add(Case("a", 5.0, 0, "plain"), {"outcome": REFUSED, "error": "InputError: no"})
+    results.add(Case("a", 5.0, 0, "ours"), {"outcome": REFUSED, "error": "InputError: no"})
     return results
 
 
@@ -182,7 +182,7 @@ def test_interval_of_many_orbits_is_that_of_their_mean():
 
 def test_differences_are_paired_so_that_orbits_do_not_blur_them():
     results = some_results()
-    gain = paired(results.values("better", 3.0, "view_db"), results.values("plain", 3.0, "view_db"))
+    gain = paired(results.values("better", 3.0, "view_db"), results.values("ours", 3.0, "view_db"))
     assert len(gain) == 6
     mean, interval = mean_and_interval(gain)
     assert mean == pytest.approx(2.0)
@@ -191,10 +191,10 @@ def test_differences_are_paired_so_that_orbits_do_not_blur_them():
 
 def test_table_and_chart_show_rows_severities_and_what_was_lost(tmp_path):
     results = some_results()
-    lines = table(results, "plain").splitlines()
+    lines = table(results, "ours").splitlines()
     assert len(lines) == 5
-    assert lines[2].startswith("| 3 | plain | 6 of 6 | 25.1 [")
+    assert lines[2].startswith("| 3 | ours | 6 of 6 | 25.1 [")
     assert lines[3].startswith("| 3 | better | 6 of 6 | 27.1 (+2.00 [2.00, 2.00])")
-    assert lines[4].startswith("| 5 | plain | 0 of 1 | - | - ")
+    assert lines[4].startswith("| 5 | ours | 0 of 1 | - | - ")
     draw(results, tmp_path / "chart.png")
     assert (tmp_path / "chart.png").read_bytes().startswith(b"\x89PNG")
