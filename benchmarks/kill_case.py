@@ -308,9 +308,15 @@ def checkpoints_in(store: Path) -> list[Path]:
 
 
 def checkpoint_steps(store: Path) -> dict[str, int]:
-    """Steps that are kept of stages half done, by key."""
+    """Steps that are kept of stages half done, by key.
+
+    A kill between publishing and tidying up leaves a checkpoint that nothing needs any more.
+    """
     steps = {}
+    published = set(Store(store).keys())
     for file in checkpoints_in(store):
+        if file.parent.name in published:
+            continue
         with open_tensors(file) as opened:
             steps[file.parent.name] = int(opened.read("__step__"))
     return steps
@@ -324,10 +330,12 @@ def harm_in(store: Path, subject: Subject) -> list[str]:
             harm.append(f"artifact {key[:8]}: {health.damage}")
     locks = [*(store / "lock").glob("*"), store / "lease"]
     harm += [f"lock {file.name[:8]} is held" for file in locks if is_locked(file)]
-    # A signal that comes once all is published finds a run that is done, and says so.
-    ends = (DONE,) if subject.process.poll() == 0 else (DIED, CANCELLED)
     record = subject.record()
-    if record is not None and record.now not in ends:
+    if record is None:
+        return harm
+    # A signal that comes once all is published finds a run that is done, and shown so.
+    is_whole = all(stage.state not in (WAITING, COMPUTING) for stage in record.stages.values())
+    if record.now not in ((DIED, CANCELLED, DONE) if is_whole else (DIED, CANCELLED)):
         harm.append(f"shown as {record.now}")
     return harm
 
