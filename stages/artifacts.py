@@ -41,7 +41,8 @@ class MaterialViews:
         normal_world: unit shading normals, straight.
         reference: index of the view at azimuth 0 that the asset was asked for by.
         depth: distance along the camera's -z axis, zero where nothing is; None where nobody knows.
-        confidence: how far each pixel is to be trusted, in [0, 1]; None means all of them wholly.
+        confidence: how much each pixel counts: 0 not at all, 1 wholly, as all do where this is
+            None; more than 1 beside what is less certain.
     """
 
     cameras: Cameras

@@ -13,18 +13,17 @@ from stages.base import Context
 from stages.photo_artifact import PreparedPhoto
 from stages.settings.generation import GenerationConfig
 from svim3d.cameras import Cameras, orbit_angles, orbit_cameras
-from svim3d.color import linear_from_srgb
 from svim3d.diffusion.agreement import choose
 from svim3d.diffusion.groups import GROUPS, GeneratedViews
 from svim3d.diffusion.guidance import GuidanceInterval
 from svim3d.diffusion.model import MaterialDiffusion, Sampling
+from svim3d.diffusion.photo_view import enlarged, resized, with_photo
 from svim3d.io.model_folder import bundled_model, read_model
 from svim3d.io.orbit_repair import MAX_SHARE_OUTSIDE, admit_views, share_outside
 from svim3d.render.orbit_scale import longest_side
 
 CLOSER = 0.98  # factor on the cameras' distance while views stick out of the object's cube
 CLOSEST = 1.0  # world units; nearer ones would soon stand inside the cube
-SMALLEST_COVERAGE = 1.0 / 510.0  # rounds to 0 of 255; protects the division by coverage
 
 
 def views_of_photo(
@@ -56,7 +55,9 @@ def views_of_photo(
             f"object's pixels {float(confidence[best.mask > 0.5].mean()):.2f}",
         )
     if config.keep_photo:
-        best = _with_photo(best, photo)
+        size = max(config.photo_view_size, best.mask.shape[1])
+        best = with_photo(enlarged(best, size), photo.rgb, photo.mask)
+        confidence = _photo_confidence(best.mask, confidence, config.photo_weight)
     try:
         cameras = place_cameras(best, angles, model.spec.fov_deg)
         cameras, images, reference = admit_views(
@@ -140,26 +141,15 @@ def _on_cpu(views: GeneratedViews) -> GeneratedViews:
     return GeneratedViews(**{name: image.float().cpu() for name, image in vars(views).items()})
 
 
-def _with_photo(views: GeneratedViews, photo: PreparedPhoto) -> GeneratedViews:
-    """The photo's colours in the last view, as far as both it and the generator see an object.
-
-    The outline stays the generator's: materials and normals end there, and the other views agree
-    with it. Where it goes beyond the photo's, the generated colour stays.
-    """
-    size = views.mask.shape[1]
-    linear = torch.cat([linear_from_srgb(photo.rgb) * photo.mask, photo.mask], -1)
-    scaled = torch.nn.functional.interpolate(
-        linear.permute(2, 0, 1)[None],
-        size=(size, size),
-        mode="bilinear",
-        align_corners=False,
-        antialias=True,
-    )[0].permute(1, 2, 0)
-    share = scaled[..., 3:]
-    straight = scaled[..., :3] / share.clamp_min(SMALLEST_COVERAGE)
-    rgb = views.rgb_linear.clone()
-    rgb[-1] = torch.lerp(rgb[-1], straight, share) * (views.mask[-1] > 0.0)
-    return GeneratedViews(**vars(views) | {"rgb_linear": rgb})
+def _photo_confidence(
+    mask: Float[Tensor, "K H W 1"], drawn: Float[Tensor, "K h w 1"] | None, weight: float
+) -> Float[Tensor, "K H W 1"] | None:
+    """Confidence of views of which the last is the photo's own."""
+    if drawn is None and weight == 1.0:
+        return None
+    trust = torch.ones_like(mask) if drawn is None else resized(drawn, mask.shape[1])
+    trust[-1] = weight
+    return trust
 
 
 def _images(

@@ -58,7 +58,14 @@ class PhotoSettings(FileReadingConfig):
     """Compile the network: worth its minutes for large models on a GPU."""
 
     keep_photo: bool = True
-    """Let the photo itself be the colour of the view that it shows. Source: SV3D."""
+    """Let the photo itself be the colour of the view that it shows (SV3D), and detail its
+    basecolor."""
+
+    photo_view_size: int = Field(default=256, ge=16, le=2048)
+    """Image rows that the views of a smaller model are enlarged to, to hold the photo's detail."""
+
+    photo_weight: float = Field(default=16.0, gt=0.0, le=1000.0)
+    """How often the photo's own view counts: the others are drawn, it is known."""
 
     @model_validator(mode="after")
     def _list_ends_at_the_photo(self) -> Self:

@@ -22,6 +22,9 @@ Notify = Callable[[str, str], None]
 Images = dict[str, Float[Tensor, "_ _ _ _"]]  # [views, rows, columns, channels]
 
 
+UNBOUNDED = ("radiance", "confidence")  # above; all else but normals and depth ends at 1
+
+
 def _log(kind: str, message: str) -> None:
     log.warning("%s: %s", kind, message)
 
@@ -51,7 +54,7 @@ def repair_images(images: Images, names: Sequence[str], notify: Notify | None) -
         elif name == "normal_world":
             images[name] = _unit_normals(image, images["mask"], names, notify)
         else:
-            highest = float("inf") if name == "radiance" else 1.0
+            highest = float("inf") if name in UNBOUNDED else 1.0
             images[name] = _clamped(image, name, highest, names, notify)
     return images
 

@@ -46,7 +46,7 @@ def draw(folder, make_context, tmp_path):
 
     def draw(seed=0, **settings) -> MaterialViews:
         context = make_context("generation", seed=seed)
-        config = GenerationConfig(model=folder, **settings)
+        config = GenerationConfig(model=folder, **{"photo_view_size": SIZE} | settings)
         return run(tmp_path, PHOTO, config=config, ctx=context)
 
     return draw
@@ -96,17 +96,17 @@ def test_views_stand_in_the_world_and_reload_to_the_same_bits(perfect, draw, tmp
     for view in range(VIEWS):
         towards = views.cameras.c2w[view, :3, 2]
         assert float((views.normal_world[view][inside[view]] @ towards).min()) > 0.0
-    assert views.depth is None and views.confidence is None
+    assert views.depth is None
     views.save(tmp_path / "saved")
     again = MaterialViews.load(tmp_path / "saved")
     for name in ("radiance", "mask", "basecolor", "roughness", "metallic", "normal_world"):
         assert torch.equal(getattr(again, name), getattr(views, name)), name
 
 
-def test_the_photo_colours_its_own_view_only(perfect, draw):
+def test_the_photo_tells_of_its_own_view_only(perfect, draw):
     kept, drawn = draw(), draw(keep_photo=False)
-    assert torch.equal(kept.radiance[:-1], drawn.radiance[:-1])
-    assert torch.equal(kept.mask, drawn.mask) and torch.equal(kept.basecolor, drawn.basecolor)
+    for name in ("radiance", "mask", "basecolor", "roughness", "metallic", "normal_world"):
+        assert torch.equal(getattr(kept, name)[:-1], getattr(drawn, name)[:-1]), name
     # 48 pixels to 16: in the middle the photo's own linear colours, averaged.
     photo = (linear_from_srgb(PHOTO.rgb) * PHOTO.mask).view(16, 3, 16, 3, 3).mean((1, 3))
     middle = slice(5, 11)
@@ -114,10 +114,30 @@ def test_the_photo_colours_its_own_view_only(perfect, draw):
         kept.radiance[-1, middle, middle], photo[middle, middle], rtol=0, atol=0.03
     )
     assert float((drawn.radiance[-1] - kept.radiance[-1]).abs().max()) > 0.1
+    torch.testing.assert_close(
+        kept.mask[-1], PHOTO.mask.view(16, 3, 16, 3, 1).mean((1, 3)), rtol=0, atol=0.155
+    )
+
+
+def test_the_photo_counts_as_often_as_asked(perfect, draw, tmp_path):
+    views = draw(photo_weight=5.0)
+    assert views.confidence is not None
+    assert bool((views.confidence[-1] == 5.0).all() and (views.confidence[:-1] == 1.0).all())
+    views.save(tmp_path / "saved")
+    assert torch.equal(MaterialViews.load(tmp_path / "saved").confidence, views.confidence)
+    assert draw(photo_weight=1.0).confidence is None
+    assert draw(keep_photo=False).confidence is None
+
+
+def test_views_of_a_small_model_are_enlarged_for_the_photo(perfect, draw):
+    views = draw(photo_view_size=40)
+    assert views.mask.shape == (VIEWS, 40, 40, 1)
+    assert (views.cameras.height, views.cameras.width) == (40, 40)
+    assert draw(photo_view_size=40, keep_photo=False).mask.shape[1] == SIZE
 
 
 def test_of_several_samples_one_is_kept_with_its_confidence(perfect, draw, make_context, tmp_path):
-    views = draw(samples=3)
+    views = draw(samples=3, keep_photo=False)
     assert views.confidence is not None
     outside = views.mask == 0.0
     assert bool((views.confidence[outside] == 1.0).all())

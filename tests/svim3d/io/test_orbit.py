@@ -48,10 +48,12 @@ def test_confidence_and_depth_are_there_where_all_views_have_them(tmp_path, came
 def test_doubtful_confidence_is_mended(images):
     told = []
     images["confidence"] = torch.full((4, 16, 16, 1), 0.5)
-    images["confidence"][2, 3, 3] = 1.5
+    images["confidence"][2, 3, 3] = -0.5
+    images["confidence"][1, 3, 3] = 16.0
     mended = repair_images(images, list("abcd"), lambda *event: told.append(event))
     assert told == [("clamped", "c: 1 values of confidence out of range")]
-    assert float(mended["confidence"].max()) == 1.0
+    assert float(mended["confidence"].min()) == 0.0
+    assert float(mended["confidence"].max()) == 16.0
 
 
 def test_files_are_the_same_bytes_each_time(tmp_path, cameras, images):
