@@ -17,18 +17,19 @@ from stages import view_remedies
 from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
 from stages.base import Context, Stage
 from stages.errors import InputError
+from stages.nerf_hull import start_hull
 from stages.nerf_terms import ray_terms
 from stages.prefilter_cache import cached_operator
 from stages.settings.nerf import NerfConfig
 from svim3d.cameras import Cameras
-from svim3d.fields.distance import signed_distance, without_hidden_parts
+from svim3d.fields.distance import without_hidden_parts
 from svim3d.fields.hash_grid import HashGridSpec
 from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
 from svim3d.fields.sdf_grid import resample_grid
 from svim3d.optim import NamedAdam, Rate
 from svim3d.render import ray_losses
 from svim3d.render.aligned_views import AlignedViews
-from svim3d.render.hull import INSIDE_COVERAGE, coverage_votes
+from svim3d.render.hull import INSIDE_COVERAGE
 from svim3d.render.march import hits_surface
 from svim3d.render.pixel_blocks import PIXELS, PixelBlocks
 from svim3d.render.volumes import DensityVolume, SdfVolume
@@ -40,14 +41,12 @@ VOLUME, SDF_GRID, ENVIRONMENT = "volume.", "volume.grid", "log_environment"  # p
 
 MIN_VIEWS = 3  # fewer silhouettes leave the hull open along whole directions
 ENVIRONMENT_EPS = 1e-8  # texels that nothing reflects keep the light they started with
-HULL_NODES = 128  # fine enough for parts of one pixel, and still computed in half a second
 MIN_RADIANCE = 1e-4  # keeps the logarithm of black texels finite
 SMALLEST_PART = 1e-4  # of the largest part's volume: smaller ones are specks
 MOMENT_POWER = {"exp_avg": 1, "exp_avg_sq": 2}  # how Adam's moments scale with the gradient
 REFRESH_EVERY = 8  # steps between updates of the empty-space grid
 WARM_UP = 10  # steps over which the rates rise, while Adam's moments fill
 CULL_RAYS = 65536  # rays tested at once for meeting the hull
-MIN_HULL_NODES = 8  # a hull of fewer nodes is noise
 
 
 @dataclass(frozen=True)
@@ -130,39 +129,6 @@ def _check(views: MaterialViews) -> None:
             f"the mask of view {empty[0]} is empty (as are {len(empty) - 1} others); every view "
             "must show the object: check channel A of these views or leave them out"
         )
-
-
-def _silhouettes(planes: dict[str, Tensor]) -> Tensor:
-    """Masks that carve the hull only where they are to be trusted."""
-    mask = planes["mask"]
-    return torch.maximum(mask, 1.0 - planes["confidence"]) if "confidence" in planes else mask
-
-
-def _hull(masks: Tensor, cameras: Cameras, config: NerfConfig, ctx: Context) -> Tensor:
-    """Signed distance of the visual hull, positive inside.
-
-    If the masks disagree so much that nothing is left, more of them may be wrong.
-    """
-    matrices = cameras.clip_from_world()
-    allowed = min(config.hull_rejections + 2, 7, len(cameras) - 2)
-    for rejections in range(min(config.hull_rejections, allowed), allowed + 1):
-        votes = coverage_votes(
-            masks[..., 0],
-            matrices,
-            nodes=HULL_NODES,
-            half_extent=config.half_extent,
-            rejections=rejections,
-        )
-        inside = votes >= INSIDE_COVERAGE
-        if int(inside.sum()) >= MIN_HULL_NODES:
-            if rejections > config.hull_rejections:
-                ctx.event("inconsistent_masks", f"hull found with {rejections} masks rejected")
-            return signed_distance(inside, config.half_extent)
-    raise InputError(
-        f"no point of the cube of half side {config.half_extent} lies in all masks but "
-        f"{allowed}: the views contradict each other or their cameras are wrong; check that the "
-        "object is centred at the origin with longest side 1 and that poses are OpenGL c2w"
-    )
 
 
 def _pixel_blocks(
@@ -327,7 +293,7 @@ def run(
     cameras, planes = views.premultiplied(config.image_size)
     cameras = cameras.to(ctx.device)
     planes = {name: plane.to(ctx.device) for name, plane in planes.items()}
-    hull = _hull(_silhouettes(planes), cameras, config, ctx)
+    hull = start_hull(planes, cameras, views.reference, config, ctx)
     planes["guide"] = ray_losses.smoothing_guide(planes["radiance"], planes.get("confidence"))
     planes = view_remedies.with_facing_trust(cameras, planes, config)
     blocks = _pixel_blocks(cameras, planes, hull, config)

@@ -24,9 +24,10 @@ class NerfConfig(StageConfig):
 
     half_extent: PositiveFloat = 0.55
     """Half the side of the cube that holds the object, world units."""
-    hull_rejections: Annotated[int, Field(ge=0, le=7)] = 0
-    """Masks that may exclude a point of the object by mistake; 1 to 2 for generated views. Where
-    that leaves no hull, up to two more are tried and an event says so."""
+    hull_rejections: Annotated[int, Field(ge=0, le=7)] | Literal["auto"] = "auto"
+    """Masks that may exclude a point of the object by mistake, the reference view's never among
+    them. `auto`: as few as let the hull fill the silhouettes. Where a number leaves no hull, up to
+    two more are tried."""
     grid_nodes: tuple[GridNodes, ...] = (64, 96, 128, 192)
     """Nodes per side of the signed-distance grid, coarse to fine; the last is what is returned."""
     grid_shares: tuple[Share, ...] = (0.0, 0.4, 0.65, 0.8)

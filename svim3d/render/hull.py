@@ -1,10 +1,11 @@
 """The visual hull: the largest shape whose silhouettes agree with the masks."""
 
+import math
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
@@ -16,6 +17,7 @@ Floats = NDArray[np.float32]
 
 INSIDE_COVERAGE = 0.5  # a box-filtered silhouette passes through half-covered pixels
 MAX_REJECTIONS = 7  # length of the kernel's sorted list, less one
+NODES_PER_PIXEL = 1.5  # at the middle of the object; leaves room for nearer parts
 
 
 @kernel()
@@ -124,3 +126,36 @@ def coverage_votes(
         votes.numpy(),
     )
     return votes
+
+
+def missed_shares(
+    inside: Bool[Tensor, "n n n"],
+    masks: Float[Tensor, "V H W"],
+    clip_from_world: Float[Tensor, "V 4 4"],
+    half_extent: float,
+) -> Float[Tensor, "V"]:
+    """Share of each view's silhouette that no node of a hull is seen at.
+
+    Zero, but for discretisation, where all masks agree: then the hull fills every silhouette.
+    Masks are averaged down until a pixel spans `NODES_PER_PIXEL` nodes, so that a solid hull leaves
+    no gaps between its nodes.
+    """
+    points = node_positions(len(inside), half_extent, like=masks)[inside]
+    # At the origin a unit of the world spans this many pixels.
+    origin = clip_from_world[:, 3, 3]
+    per_unit = 0.5 * masks.shape[1] * float((clip_from_world[:, 1, :3].norm(dim=1) / origin).max())
+    spacing = 2.0 * half_extent / (len(inside) - 1)
+    factor = max(1, math.ceil(NODES_PER_PIXEL * spacing * per_unit))
+    height, width = (max(1, side // factor) for side in masks.shape[1:])
+    small = torch.nn.functional.adaptive_avg_pool2d(masks[:, None], (height, width))[:, 0]
+    shares = []
+    for mask, matrix in zip(small, clip_from_world, strict=True):
+        clip = points @ matrix[:, :3].T + matrix[:, 3]
+        column = ((0.5 + 0.5 * clip[:, 0] / clip[:, 3]) * width).long()
+        row = ((0.5 - 0.5 * clip[:, 1] / clip[:, 3]) * height).long()
+        shown = (clip[:, 3] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        seen = torch.zeros(height, width, dtype=torch.bool, device=masks.device)
+        seen[row[shown], column[shown]] = True
+        covered = mask >= INSIDE_COVERAGE
+        shares.append((covered & ~seen).sum() / covered.sum().clamp_min(1))
+    return torch.stack(shares)

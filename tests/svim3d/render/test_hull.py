@@ -7,7 +7,7 @@ import torch
 
 from svim3d.cameras import orbit_angles, orbit_cameras
 from svim3d.fields.sdf_grid import node_positions
-from svim3d.render.hull import coverage_votes, coverage_votes_reference
+from svim3d.render.hull import coverage_votes, coverage_votes_reference, missed_shares
 
 NODES, HALF_EXTENT, RADIUS = 40, 0.55, 0.4
 
@@ -73,3 +73,25 @@ def test_object_cut_off_by_a_picture_goes_on_beyond_its_border(orbit):
 def test_impossible_number_of_rejections_is_refused(orbit):
     with pytest.raises(ValueError, match="rejections must lie in"):
         votes(*orbit, rejections=9)
+
+
+def test_a_hull_of_masks_that_agree_misses_nothing(orbit):
+    masks, matrices = orbit
+    missed = missed_shares(votes(masks, matrices) >= 0.5, masks, matrices, HALF_EXTENT)
+    assert float(missed.max()) < 0.01
+
+
+def test_a_hull_that_is_too_small_misses_the_rest_of_each_silhouette(orbit):
+    masks, matrices = orbit
+    radius = node_positions(96, HALF_EXTENT, like=masks).norm(dim=-1)
+    missed = missed_shares(radius < 0.5 * RADIUS, masks, matrices, HALF_EXTENT)
+    # Silhouettes go as the square of the radius, and a pixel is a tenth of the small one's.
+    torch.testing.assert_close(missed, torch.full_like(missed, 0.75), rtol=0, atol=0.06)
+
+
+def test_no_mask_and_no_hull_miss_nothing_and_all(orbit):
+    masks, matrices = orbit
+    nothing = torch.zeros(NODES, NODES, NODES, dtype=torch.bool)
+    assert bool((missed_shares(nothing, masks, matrices, HALF_EXTENT) == 1.0).all())
+    empty = missed_shares(nothing, torch.zeros_like(masks), matrices, HALF_EXTENT)
+    assert not bool(empty.any())

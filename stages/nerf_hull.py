@@ -1,0 +1,82 @@
+"""The hull that phase 1 starts from: carved by silhouettes as far as they agree."""
+
+import torch
+from torch import Tensor
+
+from stages.base import Context
+from stages.errors import InputError
+from stages.settings.nerf import NerfConfig
+from svim3d.cameras import Cameras
+from svim3d.fields.distance import signed_distance
+from svim3d.render.hull import INSIDE_COVERAGE, MAX_REJECTIONS, coverage_votes, missed_shares
+
+HULL_NODES = 128  # fine enough for parts of one pixel, and still computed in half a second
+MIN_HULL_NODES = 8  # a hull of fewer nodes is noise
+FURTHER = 2  # masks that may be wrong beside those that were allowed for, if no hull is left
+MAX_MISSED = 0.01  # of the silhouettes; where masks agree discretisation misses less
+
+
+def start_hull(
+    planes: dict[str, Tensor], cameras: Cameras, reference: int, config: NerfConfig, ctx: Context
+) -> Tensor:
+    """Signed distance of the visual hull, positive inside, on a grid of `HULL_NODES`.
+
+    Masks of some views may exclude a point by mistake, but never the reference view's. How many may
+    is found where the settings leave it open: as few as let the hull fill the silhouettes. If the
+    masks disagree so much that nothing is left, more of them may be wrong.
+
+    Raises:
+        InputError: no point lies in enough of the masks.
+    """
+    masks = _silhouettes(planes)[..., 0]
+    matrices = cameras.clip_from_world()
+    most = min(MAX_REJECTIONS, len(cameras) - 2)
+    asked = config.hull_rejections
+    is_open = asked == "auto"
+    allowed = 0 if asked == "auto" else min(asked, most)
+    last = most if is_open else min(allowed + FURTHER, most)
+    for rejections in range(allowed, last + 1):
+        inside = _inside(masks, matrices, reference, rejections, config.half_extent)
+        if int(inside.sum()) < MIN_HULL_NODES:
+            continue
+        missed = missed_shares(inside, masks, matrices, config.half_extent).mean()
+        if is_open and float(missed) > MAX_MISSED and rejections < last:
+            continue
+        if rejections > allowed:
+            ctx.event(
+                "inconsistent_masks",
+                f"hull found with {rejections} masks rejected; it fills the silhouettes but for "
+                f"{float(missed):.1%}",
+            )
+        return signed_distance(inside, config.half_extent)
+    raise InputError(
+        f"no point of the cube of half side {config.half_extent} lies in all masks but "
+        f"{last}: the views contradict each other or their cameras are wrong; check that the "
+        "object is centred at the origin with longest side 1 and that poses are OpenGL c2w"
+    )
+
+
+def _silhouettes(planes: dict[str, Tensor]) -> Tensor:
+    """Masks that carve the hull only where they are to be trusted."""
+    mask = planes["mask"]
+    return torch.maximum(mask, 1.0 - planes["confidence"]) if "confidence" in planes else mask
+
+
+def _inside(
+    masks: Tensor, matrices: Tensor, reference: int, rejections: int, half_extent: float
+) -> Tensor:
+    """Nodes that all masks but so many support, and the reference view's does."""
+
+    def votes(views: slice, rejected: int) -> Tensor:
+        return coverage_votes(
+            masks[views],
+            matrices[views],
+            nodes=HULL_NODES,
+            half_extent=half_extent,
+            rejections=rejected,
+        )
+
+    supported = votes(slice(None), rejections)
+    if rejections:
+        supported = torch.minimum(supported, votes(slice(reference, reference + 1), 0))
+    return supported >= INSIDE_COVERAGE
