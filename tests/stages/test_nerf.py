@@ -179,11 +179,11 @@ def shifted(views, view, columns):
 
 
 def test_a_moved_view_is_found_and_the_artifact_says_so(views, make_context, tmp_path):
-    config = TINY.model_copy(update={"hull_rejections": 1, "steps": 120})
+    config = TINY.model_copy(update={"steps": 120})
     fitted = run(shifted(views, 2, 2), None, config=config, ctx=make_context("nerf"))
     across = fitted.corrections.shifts[..., 0].mean(1) * 48 / 2
     # Some of it moves the object: there are few views, and a sphere shows little.
-    assert float(across[2]) == pytest.approx(1.5, abs=0.6)
+    assert float(across[2]) == pytest.approx(1.2, abs=0.5)
     others = [view for view in range(9) if view != 2]
     assert float(across[others].abs().max()) < 0.7
     fitted.save(tmp_path)
