@@ -38,7 +38,8 @@ LATE_HOMOGRAPHY = ("nerf.warp_start=0.5",)  # the paper's, from the middle of ph
 VIEW_MASKING = ("nerf.facing_gamma=1", "dmtet.facing_gamma=1")
 
 # The paper's ablation, then what is on by default: homographies from a tenth of phase 1 on, views
-# weighed by their agreement, no masking by angle.
+# weighed by their agreement, no masking by angle; at last what the start from a hull adds, which
+# overrules masks in all rows but the last (the paper starts from no hull).
 ROWS: dict[str, tuple[str, ...]] = {
     "no remedy": NO_HOMOGRAPHY,
     "without homography": (*NO_HOMOGRAPHY, *VIEW_MASKING),
@@ -46,6 +47,7 @@ ROWS: dict[str, tuple[str, ...]] = {
     "without view masking": LATE_HOMOGRAPHY,
     "full, as in the paper": (*LATE_HOMOGRAPHY, *VIEW_MASKING),
     "ours": (),
+    "ours, strict hull": ("nerf.hull_rejections=0",),
 }
 
 
