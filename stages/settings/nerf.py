@@ -4,13 +4,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
-from stages.settings.base import StageConfig
+from stages.settings.perceptual import PerceptualSettings
 
 GridNodes = Annotated[int, Field(ge=4, le=512)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
-class NerfConfig(StageConfig):
+class NerfConfig(PerceptualSettings):
     """Phase 1: fit a surface, its materials and its light to the views."""
 
     steps: PositiveInt = 1200
@@ -114,6 +114,11 @@ class NerfConfig(StageConfig):
     """Squared length of the bump, so that it holds only what geometry cannot."""
     light_balance_weight: NonNegativeFloat = 0.005
     """Distance of the light's colour from grey; Source: nvdiffrec."""
+    perceptual_every: PositiveInt = 4
+    """Steps from one comparison of pictures to the next; the weight makes up for those without.
+    Each is rendered for this alone."""
+    perceptual_weight: NonNegativeFloat = 1.0
+    """Distance of pictures at the end; it rises from 0, as in the paper."""
 
     @model_validator(mode="after")
     def _schedule_is_ordered(self) -> Self:

@@ -94,9 +94,13 @@ def equal(a, b):
     )
 
 
-@pytest.mark.parametrize("model", ["sdf", "density"])
-def test_killed_and_resumed_run_ends_with_equal_bytes(views, make_context, tmp_path, model):
-    config = TINY.model_copy(update={"steps": 24, "density_model": model})
+@pytest.mark.parametrize(
+    ("model", "perceptual"), [("sdf", "none"), ("density", "none"), ("sdf", "dssim")]
+)
+def test_killed_and_resumed_run_ends_with_equal_bytes(
+    views, make_context, tmp_path, model, perceptual
+):
+    config = TINY.model_copy(update={"steps": 24, "density_model": model, "perceptual": perceptual})
     whole = make_context("nerf")
     whole.checkpoints._every_s = 1e9
     want = run(views, None, config=config, ctx=whole)
@@ -126,9 +130,12 @@ def test_artifact_survives_the_disk(views, make_context, tmp_path):
     assert again.material_spec == fitted.material_spec
 
 
-def test_confidence_of_one_changes_no_bit_and_of_zero_hides_what_is_wrong(views, make_context):
+@pytest.mark.parametrize("perceptual", ["none", "dssim"])
+def test_confidence_of_one_changes_no_bit_and_of_zero_hides_what_is_wrong(
+    views, make_context, perceptual
+):
     # The last steps fit the bump too.
-    config = TINY.model_copy(update={"steps": 6})
+    config = TINY.model_copy(update={"steps": 6, "perceptual": perceptual})
 
     def fitted(shown):
         return run(shown, None, config=config, ctx=make_context("nerf"))
@@ -153,6 +160,21 @@ def test_a_mask_without_confidence_carves_nothing(views, make_context):
     assert inside[1] < 0.8 * inside[0]
     # The one step moves a few nodes across the surface.
     assert abs(inside[2] - inside[0]) < 0.01 * inside[0]
+
+
+def test_pictures_are_compared_as_often_as_asked_with_rising_weight(views, make_context):
+    told = {}
+    config = TINY.model_copy(
+        update={"steps": 12, "perceptual": "dssim", "perceptual_size": 32, "perceptual_every": 3}
+    )
+    ctx = make_context("nerf")
+    ctx.report = lambda step, _, terms: told.update({step - 1: terms.get("perceptual")})
+    fitted = run(views, None, config=config, ctx=ctx)
+    compared = {step: term for step, term in told.items() if term is not None}
+    assert list(compared) == [0, 3, 6, 9]
+    assert compared[0] == 0.0 < compared[3] < compared[9]
+    plain = config.model_copy(update={"perceptual": "none"})
+    assert not equal(fitted, run(views, None, config=plain, ctx=make_context("nerf")))
 
 
 def test_views_larger_than_the_image_size_are_averaged_down(views, make_context):
