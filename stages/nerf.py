@@ -135,12 +135,6 @@ def _check(views: MaterialViews) -> None:
         )
 
 
-def _silhouettes(planes: dict[str, Tensor]) -> Tensor:
-    """Masks that carve the hull only where they are to be trusted."""
-    mask = planes["mask"]
-    return torch.maximum(mask, 1.0 - planes["confidence"]) if "confidence" in planes else mask
-
-
 def _hull(masks: Tensor, cameras: Cameras, config: NerfConfig, ctx: Context) -> Tensor:
     """Signed distance of the visual hull, positive inside.
 
@@ -353,7 +347,8 @@ def run(
     cameras, planes = views.premultiplied(config.image_size)
     cameras = cameras.to(ctx.device)
     planes = {name: plane.to(ctx.device) for name, plane in planes.items()}
-    hull = _hull(_silhouettes(planes), cameras, config, ctx)
+    silhouettes = view_remedies.silhouettes(cameras, planes, views.reference, config, ctx)
+    hull = _hull(silhouettes, cameras, config, ctx)
     planes["guide"] = ray_losses.smoothing_guide(planes["radiance"], planes.get("confidence"))
     planes = view_remedies.with_facing_trust(cameras, planes, config)
     blocks = _pixel_blocks(cameras, planes, hull, config)

@@ -7,7 +7,7 @@ import torch
 
 from svim3d.cameras import orbit_angles, orbit_cameras
 from svim3d.fields.sdf_grid import node_positions
-from svim3d.render.hull import coverage_votes, coverage_votes_reference
+from svim3d.render.hull import coverage_votes, coverage_votes_reference, lone_carving
 
 NODES, HALF_EXTENT, RADIUS = 40, 0.55, 0.4
 
@@ -73,3 +73,19 @@ def test_object_cut_off_by_a_picture_goes_on_beyond_its_border(orbit):
 def test_impossible_number_of_rejections_is_refused(orbit):
     with pytest.raises(ValueError, match="rejections must lie in"):
         votes(*orbit, rejections=9)
+
+
+def test_a_mask_that_is_wrong_carves_alone(orbit):
+    masks, matrices = orbit
+    given = {"nodes": NODES, "half_extent": HALF_EXTENT}
+    true = lone_carving(masks, matrices, **given)
+    wrong = masks.clone()
+    wrong[3, :, 32:] = 0.0
+    carved = lone_carving(wrong, matrices, **given)
+    # Views all around a sphere leave each other next to nothing; half of it is on that side.
+    assert float(true.max()) < 0.02
+    assert float(carved[3]) == pytest.approx(0.5, abs=0.05)
+    others = torch.arange(len(masks)) != 3
+    assert float(carved[others].max()) < 0.03
+    nothing = lone_carving(torch.ones_like(masks), matrices, **given)
+    assert torch.equal(nothing, torch.zeros(len(masks)))
