@@ -18,6 +18,7 @@ from stages import view_remedies
 from stages.artifacts import FittedField, MaterialViews, RefinedSurface
 from stages.base import Context, Stage
 from stages.errors import DivergenceError, InputError
+from stages.perceptual_terms import PerceptualTerm
 from stages.prefilter_cache import cached_operator
 from stages.settings.dmtet import DmtetConfig
 from svim3d.cameras import Cameras
@@ -204,6 +205,7 @@ def _step_losses(
     cameras: Cameras,
     planes: dict[str, Tensor],
     aligned: AlignedViews | None,
+    perceptual: PerceptualTerm | None,
     *,
     step: int,
     config: DmtetConfig,
@@ -232,7 +234,10 @@ def _step_losses(
             target = {name: plane[view] for name, plane in planes.items()}
         else:
             target = _visit(aligned, view, rendered, step, config, ctx)
-        for name, value in _image_losses(rendered, target, config).items():
+        losses = _image_losses(rendered, target, config)
+        if perceptual is not None:
+            losses |= perceptual.of_view(step, view, rendered, target)
+        for name, value in losses.items():
             terms[name] = terms.get(name, 0.0) + value / config.views_per_step
     return terms
 
@@ -265,6 +270,7 @@ def _optimise(
     cameras: Cameras,
     planes: dict[str, Tensor],
     aligned: AlignedViews | None,
+    perceptual: PerceptualTerm | None,
     config: DmtetConfig,
     ctx: Context,
 ) -> None:
@@ -283,7 +289,7 @@ def _optimise(
             learnt = {} if aligned is None else aligned.state()
             ctx.checkpoints.save(step, fit.adam.state() | learnt)
         terms = _step_losses(
-            fit, operator, cameras, planes, aligned, step=step, config=config, ctx=ctx
+            fit, operator, cameras, planes, aligned, perceptual, step=step, config=config, ctx=ctx
         )
         if ctx.is_finite(step, terms):
             fit.adam.zero_grad()
@@ -314,7 +320,8 @@ def run(
     lattice, start = _build_lattice(field, config, ctx.device)
     fit = _Fit.assemble(lattice, start, field, config)
     log.info("dmtet: %d nodes, %d tetrahedra", len(lattice.nodes), len(lattice.tetrahedra))
-    _optimise(fit, cameras, planes, aligned, config, ctx)
+    perceptual = PerceptualTerm.of(cameras, planes, config, ctx)
+    _optimise(fit, cameras, planes, aligned, perceptual, config, ctx)
     if aligned is not None:
         view_remedies.tell_of_views(aligned, ctx)
     with torch.no_grad():

@@ -9,6 +9,7 @@ Source: SViM3D sec. 4 (phase 1 of the reconstruction), on top of Instant-NGP and
 
 import logging
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +20,7 @@ from stages.base import Context, Stage
 from stages.errors import InputError
 from stages.nerf_hull import start_hull
 from stages.nerf_terms import ray_terms
+from stages.perceptual_terms import PerceptualTerm
 from stages.prefilter_cache import cached_operator
 from stages.settings.nerf import NerfConfig
 from svim3d.cameras import Cameras
@@ -30,10 +32,11 @@ from svim3d.optim import NamedAdam, Rate
 from svim3d.render import ray_losses
 from svim3d.render.aligned_views import AlignedViews
 from svim3d.render.hull import INSIDE_COVERAGE
-from svim3d.render.march import hits_surface
+from svim3d.render.march import Rays, hits_surface
 from svim3d.render.pixel_blocks import PIXELS, PixelBlocks
 from svim3d.render.volumes import DensityVolume, SdfVolume
-from svim3d.render.volumetric import render_rays
+from svim3d.render.volumetric import Rendered, render_rays
+from svim3d.shading.prefilter import EnvironmentPyramid
 
 log = logging.getLogger(__name__)
 
@@ -195,8 +198,37 @@ def _draw(blocks: PixelBlocks, step: int, config: NerfConfig, ctx: Context) -> P
     return blocks.take(order[place * count : (place + 1) * count].to(ctx.device))
 
 
+def _render(
+    fit: _Fit,
+    pyramid: EnvironmentPyramid,
+    rays: Rays,
+    name: str,
+    *,
+    step: int,
+    config: NerfConfig,
+    ctx: Context,
+) -> Rendered:
+    """What rays see at a step; `name` tells those of one step apart."""
+    jitter = torch.rand(len(rays.origins), generator=ctx.generator(f"{name} {step}"))
+    return render_rays(
+        fit.volume,
+        fit.materials,
+        rays,
+        jitter=jitter.to(ctx.device),
+        pyramid=pyramid,
+        min_weight=config.min_weight,
+        use_bump=step >= config.bump_start * config.steps,
+        multiple_scattering=config.multiple_scattering,
+    )
+
+
 def _optimise(
-    fit: _Fit, blocks: PixelBlocks, aligned: AlignedViews | None, config: NerfConfig, ctx: Context
+    fit: _Fit,
+    blocks: PixelBlocks,
+    aligned: AlignedViews | None,
+    perceptual: PerceptualTerm | None,
+    config: NerfConfig,
+    ctx: Context,
 ) -> None:
     """The loop. State is saved where the empty-space grid is a function of the parameters."""
     operator = cached_operator(ctx.shared, len(fit.log_environment))
@@ -217,17 +249,9 @@ def _optimise(
         batch = _draw(blocks, step, config, ctx)
         if warped is not None:
             batch = batch.showing(warped.targets(batch.pixels))
-        jitter = torch.rand(batch.pixels.numel(), generator=ctx.generator(f"jitter {step}"))
-        rendered = render_rays(
-            fit.volume,
-            fit.materials,
-            batch.rays(),
-            jitter=jitter.to(ctx.device),
-            pyramid=operator(fit.log_environment.exp()),
-            min_weight=config.min_weight,
-            use_bump=step >= config.bump_start * config.steps,
-            multiple_scattering=config.multiple_scattering,
-        )
+        light = operator(fit.log_environment.exp())
+        render = partial(_render, fit, light, step=step, config=config, ctx=ctx)
+        rendered = render(batch.rays(), "jitter")
         if warped is not None:
             warped.observe(batch.pixels, rendered.surface_images(), batch.targets)
         terms = ray_terms(
@@ -237,6 +261,8 @@ def _optimise(
             done=step / config.steps,
             config=config,
         )
+        if perceptual is not None:
+            terms |= perceptual.of_rays(step, render, warped)
         if ctx.is_finite(step, terms):
             fit.adam.zero_grad()
             torch.stack(list(terms.values())).sum().backward()
@@ -299,7 +325,8 @@ def run(
     blocks = _pixel_blocks(cameras, planes, hull, config)
     fit = _start(hull, environment, config, ctx)
     aligned = view_remedies.align_views(cameras, planes, views.reference, config)
-    _optimise(fit, blocks, aligned, config, ctx)
+    perceptual = PerceptualTerm.of(cameras, planes, config, ctx)
+    _optimise(fit, blocks, aligned, perceptual, config, ctx)
     if aligned is not None:
         view_remedies.tell_of_views(aligned, ctx)
     sdf = fit.volume.signed_distance(config.grid_nodes[-1])

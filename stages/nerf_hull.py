@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from stages import view_remedies
 from stages.base import Context
 from stages.errors import InputError
 from stages.settings.nerf import NerfConfig
@@ -13,7 +14,7 @@ from svim3d.render.hull import INSIDE_COVERAGE, MAX_REJECTIONS, coverage_votes, 
 HULL_NODES = 128  # fine enough for parts of one pixel, and still computed in half a second
 MIN_HULL_NODES = 8  # a hull of fewer nodes is noise
 FURTHER = 2  # masks that may be wrong beside those that were allowed for, if no hull is left
-MAX_MISSED = 0.01  # of the silhouettes; where masks agree discretisation misses less
+MAX_MISSED = 0.03  # of the reference's silhouette; more masks overruled fill holes and gaps
 
 
 def start_hull(
@@ -22,13 +23,13 @@ def start_hull(
     """Signed distance of the visual hull, positive inside, on a grid of `HULL_NODES`.
 
     Masks of some views may exclude a point by mistake, but never the reference view's. How many may
-    is found where the settings leave it open: as few as let the hull fill the silhouettes. If the
-    masks disagree so much that nothing is left, more of them may be wrong.
+    is found where the settings leave it open: as few as let the hull fill that view's silhouette.
+    If the masks disagree so much that nothing is left, more of them may be wrong.
 
     Raises:
         InputError: no point lies in enough of the masks.
     """
-    masks = _silhouettes(planes)[..., 0]
+    masks = view_remedies.silhouettes(cameras, planes, reference, config, ctx)[..., 0]
     matrices = cameras.clip_from_world()
     most = min(MAX_REJECTIONS, len(cameras) - 2)
     asked = config.hull_rejections
@@ -39,14 +40,15 @@ def start_hull(
         inside = _inside(masks, matrices, reference, rejections, config.half_extent)
         if int(inside.sum()) < MIN_HULL_NODES:
             continue
-        missed = missed_shares(inside, masks, matrices, config.half_extent).mean()
-        if is_open and float(missed) > MAX_MISSED and rejections < last:
+        own = slice(reference, reference + 1)
+        missed = float(missed_shares(inside, masks[own], matrices[own], config.half_extent))
+        if is_open and missed > MAX_MISSED and rejections < last:
             continue
         if rejections > allowed:
             ctx.event(
                 "inconsistent_masks",
-                f"hull found with {rejections} masks rejected; it fills the silhouettes but for "
-                f"{float(missed):.1%}",
+                f"hull found with {rejections} masks rejected; it fills the reference view's "
+                f"silhouette but for {missed:.1%}",
             )
         return signed_distance(inside, config.half_extent)
     raise InputError(
@@ -54,12 +56,6 @@ def start_hull(
         f"{last}: the views contradict each other or their cameras are wrong; check that the "
         "object is centred at the origin with longest side 1 and that poses are OpenGL c2w"
     )
-
-
-def _silhouettes(planes: dict[str, Tensor]) -> Tensor:
-    """Masks that carve the hull only where they are to be trusted."""
-    mask = planes["mask"]
-    return torch.maximum(mask, 1.0 - planes["confidence"]) if "confidence" in planes else mask
 
 
 def _inside(

@@ -8,12 +8,49 @@ from stages.settings.dmtet import DmtetConfig
 from stages.settings.nerf import NerfConfig
 from svim3d.cameras import Cameras
 from svim3d.render.aligned_views import AlignedViews
-from svim3d.render.view_trust import facing_trust
+from svim3d.render.hull import lone_carving
+from svim3d.render.view_trust import facing_trust, view_weights
 from svim3d.render.view_warps import ViewCorrections
 
 TOLD_WEIGHT = 0.7  # of a view; a lower one is told
 TOLD_LIMIT = 0.99  # share of the largest corner shift; a warp beyond it is told as bound
 FACING = "facing"  # name of the plane that holds the trust by angle
+MIN_MASKS = 8  # of fewer, each has to carve what the others leave
+LEAST_TAKEN = 0.04  # of a hull: shifted views take as much, and their homographies mend them
+COARSE_NODES = 48  # of the grid on which masks are held against each other
+
+
+def silhouettes(
+    cameras: Cameras,
+    planes: dict[str, Tensor],
+    reference: int,
+    config: NerfConfig,
+    ctx: Context,
+) -> Tensor:
+    """Masks that carve the hull only where they are to be trusted.
+
+    One that takes far more from it than any other does is wrong: a hull that it has carved would
+    lack what all other views show. It carves nothing, and is told; its loss stays. A hull that is
+    to reject masks point by point has no need of this.
+    """
+    mask = planes["mask"]
+    if "confidence" in planes:
+        mask = torch.maximum(mask, 1.0 - planes["confidence"])
+    asked_to_reject = config.hull_rejections not in (0, "auto")
+    if not config.weigh_views or asked_to_reject or len(mask) < MIN_MASKS:
+        return mask
+    taken = lone_carving(
+        mask[..., 0],
+        cameras.clip_from_world(),
+        nodes=COARSE_NODES,
+        half_extent=config.half_extent,
+    )
+    outvoted = view_weights(taken.clamp_min(LEAST_TAKEN), reference) < TOLD_WEIGHT
+    for view in torch.nonzero(outvoted)[:, 0].tolist():
+        ctx.event(
+            "mask_outvoted", f"the mask of view {view} fits none of the others: it shapes no hull"
+        )
+    return torch.where(outvoted[:, None, None, None], 1.0, mask)
 
 
 def align_views(

@@ -1,5 +1,6 @@
 """What all tests share: shape checking, quiet thread pools, contexts, real data where it lies."""
 
+import math
 import os
 
 # Before torch and numba are imported. Pools that spin starve each other; with one worker per core
@@ -35,10 +36,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def make_context(tmp_path: Path) -> Callable[..., Context]:
     """`make_context("nerf")`: a context of that stage in a folder of its own.
 
-    The same name gives the same work folder, so a second context resumes what the first left.
+    The same name gives the same work folder, so a second context resumes what the first left;
+    that is nothing unless the test asks for checkpoints, however slow the machine is.
     """
 
     def make(stage: str, *, seed: int = 0, **rest) -> Context:
+        rest.setdefault("checkpoint_every_s", math.inf)
         return Context(
             stage,
             torch.device("cpu"),

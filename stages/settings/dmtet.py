@@ -4,12 +4,12 @@ from typing import Annotated
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from stages.settings.base import StageConfig
+from stages.settings.perceptual import PerceptualSettings
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
-class DmtetConfig(StageConfig):
+class DmtetConfig(PerceptualSettings):
     """Phase 2: refine an explicit surface, its materials and its light on whole images."""
 
     steps: PositiveInt = 150
@@ -73,3 +73,5 @@ class DmtetConfig(StageConfig):
     """Squared distance from the neighbours' mean, in cells; too much erases thin parts."""
     light_balance_weight: NonNegativeFloat = 0.005
     """Distance of the light's colour from grey; Source: nvdiffrec."""
+    perceptual_weight: NonNegativeFloat = 0.7
+    """Distance of pictures: less than at the end of phase 1, as in the paper."""

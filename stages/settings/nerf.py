@@ -4,13 +4,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
-from stages.settings.base import StageConfig
+from stages.settings.perceptual import PerceptualSettings
 
 GridNodes = Annotated[int, Field(ge=4, le=512)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
-class NerfConfig(StageConfig):
+class NerfConfig(PerceptualSettings):
     """Phase 1: fit a surface, its materials and its light to the views."""
 
     steps: PositiveInt = 1200
@@ -26,8 +26,8 @@ class NerfConfig(StageConfig):
     """Half the side of the cube that holds the object, world units."""
     hull_rejections: Annotated[int, Field(ge=0, le=7)] | Literal["auto"] = "auto"
     """Masks that may exclude a point of the object by mistake, the reference view's never among
-    them. `auto`: as few as let the hull fill the silhouettes. Where a number leaves no hull, up to
-    two more are tried."""
+    them. `auto`: as few as let the hull fill that view's silhouette. Where a number leaves no
+    hull, up to two more are tried."""
     grid_nodes: tuple[GridNodes, ...] = (64, 96, 128, 192)
     """Nodes per side of the signed-distance grid, coarse to fine; the last is what is returned."""
     grid_shares: tuple[Share, ...] = (0.0, 0.4, 0.65, 0.8)
@@ -115,6 +115,11 @@ class NerfConfig(StageConfig):
     """Squared length of the bump, so that it holds only what geometry cannot."""
     light_balance_weight: NonNegativeFloat = 0.005
     """Distance of the light's colour from grey; Source: nvdiffrec."""
+    perceptual_every: PositiveInt = 4
+    """Steps from one comparison of pictures to the next; the weight makes up for those without.
+    Each is rendered for this alone."""
+    perceptual_weight: NonNegativeFloat = 1.0
+    """Distance of pictures at the end; it rises from 0, as in the paper."""
 
     @model_validator(mode="after")
     def _schedule_is_ordered(self) -> Self:

@@ -59,6 +59,28 @@ def load_tensors(file: Path) -> dict[str, Tensor]:
         return {name: opened.read(name) for name in opened.shapes}
 
 
+def load_state(file: Path) -> dict[str, Tensor]:
+    """All tensors of a safetensors file or of what torch.save made of a state, on the CPU.
+
+    The latter is read by an unpickler that knows tensors and plain containers and nothing else.
+
+    Raises:
+        ValueError: see `open_tensors`; or a pickled file holds something else.
+    """
+    try:
+        return load_tensors(file)
+    except ValueError:
+        if not (file.is_file() and _is_pickled(file)):
+            raise
+    try:
+        state = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # of any kind, by what is wrong with the file
+        raise ValueError(f"{file} holds no state of a network: {error}") from error
+    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
+        raise ValueError(f"wanted named tensors in {file}, got another object; save a state_dict()")
+    return dict(state)
+
+
 def load_metadata(file: Path) -> dict[str, str]:
     """The texts in a file's header; empty where there are none.
 

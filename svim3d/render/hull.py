@@ -80,15 +80,46 @@ def coverage_votes_reference(
     points = node_positions(nodes, half_extent, like=masks).reshape(-1, 3)
     kept = masks.new_ones(rejections + 1, len(points))
     for mask, matrix in zip(masks, clip_from_world, strict=True):
-        clip = points @ matrix[:, :3].T + matrix[:, 3]
-        ndc = clip[:, :2] / clip[:, 3:]
-        grid = torch.stack([ndc[:, 0], -ndc[:, 1]], -1)
-        value = torch.nn.functional.grid_sample(
-            mask[None, None], grid[None, None], padding_mode="border", align_corners=False
-        ).view(-1)
-        value = value.masked_fill(clip[:, 3] <= 0.0, 1.0)  # behind: no evidence
+        value = _coverage_at(points, mask, matrix)
         kept = torch.cat([kept, value[None]]).sort(0).values[: rejections + 1]
     return kept[rejections].view(nodes, nodes, nodes)
+
+
+def _coverage_at(
+    points: Float[Tensor, "N 3"], mask: Float[Tensor, "H W"], matrix: Float[Tensor, "4 4"]
+) -> Float[Tensor, "N"]:
+    """Bilinear mask values where a camera sees points; one behind it, where it has no evidence."""
+    clip = points @ matrix[:, :3].T + matrix[:, 3]
+    ndc = clip[:, :2] / clip[:, 3:]
+    grid = torch.stack([ndc[:, 0], -ndc[:, 1]], -1)
+    value = torch.nn.functional.grid_sample(
+        mask[None, None], grid[None, None], padding_mode="border", align_corners=False
+    ).view(-1)
+    return value.masked_fill(clip[:, 3] <= 0.0, 1.0)
+
+
+def lone_carving(
+    masks: Float[Tensor, "V H W"],
+    clip_from_world: Float[Tensor, "V 4 4"],
+    *,
+    nodes: int,
+    half_extent: float,
+) -> Float[Tensor, "V"]:
+    """Share of the hull of all others that each mask takes away, on a cubic grid.
+
+    True masks around an object leave each other little to take: what a view does not show as
+    background, its neighbours nearly do. A mask that is wrong takes what no other does.
+    """
+    points = node_positions(nodes, half_extent, like=masks).reshape(-1, 3)
+    excluded = torch.stack(
+        [
+            _coverage_at(points, mask, matrix) < INSIDE_COVERAGE
+            for mask, matrix in zip(masks, clip_from_world, strict=True)
+        ]
+    )
+    votes = excluded.sum(0)
+    taken = (excluded & (votes == 1)).sum(1).to(masks)
+    return taken / ((votes == 0).sum() + taken).clamp_min(1.0)
 
 
 def coverage_votes(

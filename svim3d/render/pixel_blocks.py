@@ -64,9 +64,14 @@ class PixelBlocks:
 
     def rays(self) -> Rays:
         """Rays through the pixels' centres, block after block."""
-        flat = self.pixels.reshape(-1)
-        view = flat // (self.cameras.height * self.cameras.width)
-        local = self.cameras.pixel_directions(flat % (self.cameras.height * self.cameras.width))
-        rotation = self.cameras.c2w[:, :3, :3].index_select(0, view)
-        directions = (rotation @ local[..., None])[..., 0]
-        return Rays(self.cameras.positions.index_select(0, view), directions)
+        return pixel_rays(self.cameras, self.pixels.reshape(-1))
+
+
+def pixel_rays(cameras: Cameras, pixels: Int[Tensor, "P"]) -> Rays:
+    """Rays through the centres of pixels, given by flat indices into those of all views."""
+    per_view = cameras.height * cameras.width
+    view = pixels // per_view
+    local = cameras.pixel_directions(pixels % per_view)
+    rotation = cameras.c2w[:, :3, :3].index_select(0, view)
+    directions = (rotation @ local[..., None])[..., 0]
+    return Rays(cameras.positions.index_select(0, view), directions)

@@ -95,9 +95,14 @@ def test_the_same_seed_gives_the_same_bytes(views, field, make_context):
     assert not equal(first, other)
 
 
-def test_sure_pixels_change_no_bit_and_doubtful_ones_teach_nothing(views, field, make_context):
+@pytest.mark.parametrize("perceptual", ["none", "dssim"])
+def test_sure_pixels_change_no_bit_and_doubtful_ones_teach_nothing(
+    views, field, make_context, perceptual
+):
+    config = QUICK.model_copy(update={"perceptual": perceptual})
+
     def refined(shown: MaterialViews) -> RefinedSurface:
-        return DMTET.run(shown, field, config=QUICK, ctx=make_context("dmtet"))
+        return DMTET.run(shown, field, config=config, ctx=make_context("dmtet"))
 
     assert equal(refined(trusted(views)), refined(views))
     assert equal(refined(spoilt(views)), refined(warned(views)))
@@ -146,8 +151,12 @@ def test_a_warp_that_never_fits_begins_anew_and_is_told(views, field, make_conte
     assert float(refined.corrections.shifts[2].abs().max()) < 0.05
 
 
-def test_a_killed_run_resumes_to_the_same_bytes(views, field, make_context, monkeypatch):
-    whole = DMTET.run(views, field, config=QUICK, ctx=make_context("dmtet"))
+@pytest.mark.parametrize("perceptual", ["none", "dssim"])
+def test_a_killed_run_resumes_to_the_same_bytes(
+    views, field, make_context, monkeypatch, perceptual
+):
+    config = QUICK.model_copy(update={"perceptual": perceptual})
+    whole = DMTET.run(views, field, config=config, ctx=make_context("dmtet"))
     killed = make_context("dmtet")
     killed.checkpoints._every_s = 0.0
     report = killed.report
@@ -159,12 +168,22 @@ def test_a_killed_run_resumes_to_the_same_bytes(views, field, make_context, monk
 
     monkeypatch.setattr(killed, "report", report_and_die)
     with pytest.raises(KeyboardInterrupt):
-        DMTET.run(views, field, config=QUICK, ctx=killed)
+        DMTET.run(views, field, config=config, ctx=killed)
     resumed = make_context("dmtet")
     saved = resumed.checkpoints.load()
     assert saved is not None
     assert saved[0] == 2
-    assert equal(DMTET.run(views, field, config=QUICK, ctx=resumed), whole)
+    assert equal(DMTET.run(views, field, config=config, ctx=resumed), whole)
+
+
+def test_pictures_are_compared_if_asked(views, field, make_context):
+    told = []
+    config = QUICK.model_copy(update={"perceptual": "dssim", "perceptual_every": 2})
+    ctx = make_context("dmtet")
+    ctx.report = lambda step, _, terms: told.append("perceptual" in terms)
+    refined = DMTET.run(views, field, config=config, ctx=ctx)
+    assert told == [True, False, True, False]
+    assert not equal(refined, DMTET.run(views, field, config=QUICK, ctx=make_context("dmtet")))
 
 
 def test_a_field_without_a_surface_is_refused_with_advice(views, field, make_context):

@@ -1,6 +1,7 @@
 """Phase 1 through `run`: a painted sphere is found, repeatably to the bit; bad input is named."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -94,9 +95,13 @@ def equal(a, b):
     )
 
 
-@pytest.mark.parametrize("model", ["sdf", "density"])
-def test_killed_and_resumed_run_ends_with_equal_bytes(views, make_context, tmp_path, model):
-    config = TINY.model_copy(update={"steps": 24, "density_model": model})
+@pytest.mark.parametrize(
+    ("model", "perceptual"), [("sdf", "none"), ("density", "none"), ("sdf", "dssim")]
+)
+def test_killed_and_resumed_run_ends_with_equal_bytes(
+    views, make_context, tmp_path, model, perceptual
+):
+    config = TINY.model_copy(update={"steps": 24, "density_model": model, "perceptual": perceptual})
     whole = make_context("nerf")
     whole.checkpoints._every_s = 1e9
     want = run(views, None, config=config, ctx=whole)
@@ -126,9 +131,12 @@ def test_artifact_survives_the_disk(views, make_context, tmp_path):
     assert again.material_spec == fitted.material_spec
 
 
-def test_confidence_of_one_changes_no_bit_and_of_zero_hides_what_is_wrong(views, make_context):
+@pytest.mark.parametrize("perceptual", ["none", "dssim"])
+def test_confidence_of_one_changes_no_bit_and_of_zero_hides_what_is_wrong(
+    views, make_context, perceptual
+):
     # The last steps fit the bump too.
-    config = TINY.model_copy(update={"steps": 6})
+    config = TINY.model_copy(update={"steps": 6, "perceptual": perceptual})
 
     def fitted(shown):
         return run(shown, None, config=config, ctx=make_context("nerf"))
@@ -153,6 +161,21 @@ def test_a_mask_without_confidence_carves_nothing(views, make_context):
     assert inside[1] < 0.8 * inside[0]
     # The one step moves a few nodes across the surface.
     assert abs(inside[2] - inside[0]) < 0.01 * inside[0]
+
+
+def test_pictures_are_compared_as_often_as_asked_with_rising_weight(views, make_context):
+    told = {}
+    config = TINY.model_copy(
+        update={"steps": 12, "perceptual": "dssim", "perceptual_size": 32, "perceptual_every": 3}
+    )
+    ctx = make_context("nerf")
+    ctx.report = lambda step, _, terms: told.update({step - 1: terms.get("perceptual")})
+    fitted = run(views, None, config=config, ctx=ctx)
+    compared = {step: term for step, term in told.items() if term is not None}
+    assert list(compared) == [0, 3, 6, 9]
+    assert compared[0] == 0.0 < compared[3] < compared[9]
+    plain = config.model_copy(update={"perceptual": "none"})
+    assert not equal(fitted, run(views, None, config=plain, ctx=make_context("nerf")))
 
 
 def test_views_larger_than_the_image_size_are_averaged_down(views, make_context):
@@ -193,6 +216,40 @@ def test_a_moved_view_is_found_and_the_artifact_says_so(views, make_context, tmp
     assert again.own_surface().corrections is again.corrections
     off = TINY.model_copy(update={"steps": 2, "warp_start": 1.0})
     assert run(views, None, config=off, ctx=make_context("nerf")).corrections is None
+
+
+def seen_from_elsewhere(views, view, azimuth_deg):
+    """The same views, one of them showing what a camera that stands elsewhere sees."""
+    turn = rotation_about_y(azimuth_deg)
+    turned = dataclasses.replace(views.cameras, c2w=turn @ views.cameras.c2w)
+    images = {name: getattr(views, name).clone() for name in sphere_images(views.cameras[[0]])}
+    for name, image in sphere_images(turned).items():
+        images[name][view] = image[view]
+    return dataclasses.replace(views, **images)
+
+
+def rotation_about_y(angle_deg):
+    angle = math.radians(angle_deg)
+    turn = torch.eye(4)
+    turn[0, 0] = turn[2, 2] = math.cos(angle)
+    turn[0, 2], turn[2, 0] = math.sin(angle), -math.sin(angle)
+    return turn
+
+
+def test_a_view_that_fights_all_others_is_told_and_does_little_harm(views, make_context):
+    config = TINY.model_copy(update={"steps": 120})
+    ctx = make_context("nerf")
+    fitted = run(seen_from_elsewhere(views, 2, 30.0), None, config=config, ctx=ctx)
+    assert [event["kind"] for event in ctx.events] == ["view_outvoted"]
+    assert ctx.events[0]["message"].startswith("view 2 disagrees with the others")
+    weights = fitted.corrections.weights
+    assert float(weights[2]) < 0.5
+    others = [view for view in range(9) if view != 2]
+    assert bool((weights[others] == 1.0).all())
+    left_out = dataclasses.replace(only(views, others), reference=7)
+    without = run(left_out, None, config=config, ctx=make_context("nerf"))
+    assert surface_error(fitted) < 1.25 * surface_error(without)
+    assert basecolor_error(fitted) < 1.25 * basecolor_error(without)
 
 
 def test_plain_views_do_not_drift(views, make_context):
@@ -255,9 +312,12 @@ def test_one_wrong_mask_is_outvoted_and_reported(views, make_context):
     broken = dataclasses.replace(views, mask=views.mask.clone())
     broken.mask[2] = 0.0
     broken.mask[2, :4, :4] = 1.0
-    ctx = make_context("nerf")
-    run(broken, None, config=TINY.model_copy(update={"steps": 2}), ctx=ctx)
-    assert [event["kind"] for event in ctx.events] == ["inconsistent_masks"]
+    # By the others at once or, where views are not weighed, once no hull is left.
+    for weigh, told in ((True, "mask_outvoted"), (False, "inconsistent_masks")):
+        ctx = make_context(f"nerf {weigh}")
+        config = TINY.model_copy(update={"steps": 2, "weigh_views": weigh})
+        run(broken, None, config=config, ctx=ctx)
+        assert [event["kind"] for event in ctx.events] == [told]
 
 
 def test_schedule_is_checked():

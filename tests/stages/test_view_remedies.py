@@ -48,6 +48,40 @@ def test_figures_are_in_pixels():
     )
 
 
+def many_views():
+    """Cameras of nine views of a sphere and their planes."""
+    cameras = sphere_cameras(views=9, size=24)
+    views = MaterialViews(cameras=cameras, reference=8, **sphere_images(cameras))
+    return views.premultiplied(24)
+
+
+def test_a_mask_that_takes_what_no_other_does_carves_nothing(make_context):
+    cameras, planes = many_views()
+    planes["mask"][2, :, 12:] = 0.0
+    ctx = make_context("nerf")
+    carving = view_remedies.silhouettes(cameras, planes, 8, NerfConfig(), ctx)
+    others = [view for view in range(9) if view != 2]
+    assert torch.equal(carving[others], planes["mask"][others])
+    assert bool((carving[2] == 1.0).all())
+    assert [event["kind"] for event in ctx.events] == ["mask_outvoted"]
+    # The reference is what the asset was asked for by, and few views leave each other much to do.
+    for kept in (
+        view_remedies.silhouettes(cameras, planes, 2, NerfConfig(), ctx),
+        view_remedies.silhouettes(cameras, planes, 8, NerfConfig(weigh_views=False), ctx),
+        view_remedies.silhouettes(cameras, planes, 8, NerfConfig(hull_rejections=1), ctx),
+        view_remedies.silhouettes(cameras[:7], {"mask": planes["mask"][:7]}, 6, NerfConfig(), ctx),
+    ):
+        assert torch.equal(kept, planes["mask"][: len(kept)])
+
+
+def test_true_masks_carve_as_they_are(make_context):
+    cameras, planes = many_views()
+    ctx = make_context("nerf")
+    carving = view_remedies.silhouettes(cameras, planes, 8, NerfConfig(), ctx)
+    assert torch.equal(carving, planes["mask"])
+    assert ctx.events == []
+
+
 @pytest.mark.parametrize("kind", [NerfConfig, DmtetConfig])
 def test_switched_off_they_leave_everything_as_it_is(kind):
     config = kind(warp_start=1.0, facing_gamma=0.0)

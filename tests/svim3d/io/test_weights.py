@@ -1,4 +1,7 @@
-"""Safetensors files: written one tensor at a time, looked into without reading, never unpickled."""
+"""Safetensors files: written one tensor at a time, looked into without reading.
+
+What torch.save wrote is read only where that is asked for, and only tensors are.
+"""
 
 import pickle
 
@@ -8,6 +11,7 @@ from safetensors.torch import load_file, save_file
 
 from svim3d.io.weights import (
     load_sealed,
+    load_state,
     load_tensors,
     open_tensors,
     save_one_by_one,
@@ -151,3 +155,28 @@ def test_flipped_bit_anywhere_is_noticed_or_harmless(tmp_path):
         assert set(read) == set(tensors)
         assert all(torch.equal(read[name], value) for name, value in tensors.items())
     assert noticed > 0.8 * len(whole)  # the name of the seal, and spaces, may be anything
+
+
+def test_a_state_is_read_from_either_kind_of_file(tmp_path):
+    torch.save(TENSORS, tmp_path / "a.pth")
+    save_tensors(tmp_path / "a.safetensors", TENSORS)
+    for name in ("a.pth", "a.safetensors"):
+        found = load_state(tmp_path / name)
+        assert set(found) == set(TENSORS)
+        assert all(torch.equal(found[key], tensor) for key, tensor in TENSORS.items())
+
+
+class Harmful:
+    def __reduce__(self):
+        return print, ("unpickled",)
+
+
+def test_a_pickle_of_anything_else_is_refused_and_never_run(tmp_path, capsys):
+    file = tmp_path / "a.pth"
+    torch.save({"a": Harmful()}, file)
+    with pytest.raises(ValueError, match="holds no state of a network"):
+        load_state(file)
+    assert capsys.readouterr().out == ""
+    torch.save([torch.ones(1)], file)
+    with pytest.raises(ValueError, match="wanted named tensors"):
+        load_state(file)

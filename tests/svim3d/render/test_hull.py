@@ -7,7 +7,12 @@ import torch
 
 from svim3d.cameras import orbit_angles, orbit_cameras
 from svim3d.fields.sdf_grid import node_positions
-from svim3d.render.hull import coverage_votes, coverage_votes_reference, missed_shares
+from svim3d.render.hull import (
+    coverage_votes,
+    coverage_votes_reference,
+    lone_carving,
+    missed_shares,
+)
 
 NODES, HALF_EXTENT, RADIUS = 40, 0.55, 0.4
 
@@ -95,3 +100,19 @@ def test_no_mask_and_no_hull_miss_nothing_and_all(orbit):
     assert bool((missed_shares(nothing, masks, matrices, HALF_EXTENT) == 1.0).all())
     empty = missed_shares(nothing, torch.zeros_like(masks), matrices, HALF_EXTENT)
     assert not bool(empty.any())
+
+
+def test_a_mask_that_is_wrong_carves_alone(orbit):
+    masks, matrices = orbit
+    given = {"nodes": NODES, "half_extent": HALF_EXTENT}
+    true = lone_carving(masks, matrices, **given)
+    wrong = masks.clone()
+    wrong[3, :, 32:] = 0.0
+    carved = lone_carving(wrong, matrices, **given)
+    # Views all around a sphere leave each other next to nothing; half of it is on that side.
+    assert float(true.max()) < 0.02
+    assert float(carved[3]) == pytest.approx(0.5, abs=0.05)
+    others = torch.arange(len(masks)) != 3
+    assert float(carved[others].max()) < 0.03
+    nothing = lone_carving(torch.ones_like(masks), matrices, **given)
+    assert torch.equal(nothing, torch.zeros(len(masks)))
