@@ -20,6 +20,7 @@ WIDE_GAP_DEG = 100.0  # between neighbours in azimuth; what faces its middle is 
 CUT_SHARE = 0.1  # of a side of the frame, covered by the object
 PLATEAU = 1e-3  # relative distance to the largest value, within which highlights are one value
 CLIPPED_SHARE = 0.01  # of the covered pixels, on that plateau
+GLARE = 300.0  # times what a twentieth of the object exceeds: sparkles of noise, or a bare lamp
 DARK, DARK_SHARE = 0.02, 0.5  # luminance of the basecolor, and share of the pixels below it
 MIRROR_ROUGHNESS, MIRROR_SHARE = 0.2, 0.25
 SOFT_PX = 3.5  # width of the ramp of coverage; a pixel's own box makes one or two
@@ -50,6 +51,7 @@ def view_findings(cameras: Cameras, images: Images) -> list[Finding]:
         *_cut_off(covered),
         *_soft(images["mask"], covered),
         *_clipped(images, covered),
+        *_glaring(images, covered),
         *_dark(images, covered),
         *_mirror(images, covered),
         *_grazing(cameras, images, covered),
@@ -111,6 +113,19 @@ def _clipped(images: Images, covered: Bool[Tensor, "V H W"]) -> Iterator[Finding
             "clipped_highlights",
             f"{share:.1%} of the object has the one brightest value {top:.3g}: highlights are cut "
             "off, and the light comes out too dim; give radiance before it is clipped",
+        )
+
+
+def _glaring(images: Images, covered: Bool[Tensor, "V H W"]) -> Iterator[Finding]:
+    values = images["radiance"].amax(-1)
+    bright = torch.sort(values[covered]).values
+    usual = float(bright[int(0.95 * (len(bright) - 1))])
+    count = int((values > GLARE * usual).sum())
+    if usual > 0.0 and count:
+        yield (
+            "glaring_pixels",
+            f"{count} pixels are up to {float(values.max()) / usual:.3g} times as bright as the "
+            "bright part of the object: they lead the light astray if they are noise",
         )
 
 

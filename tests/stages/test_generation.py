@@ -188,6 +188,16 @@ def test_few_non_finite_pixels_are_mended_and_told(folder, ctx, images, value, c
         assert all(pixel == [2, 8, 8] for pixel in changed.tolist())
 
 
+def test_radiance_at_the_end_of_half_floats_counts_as_infinite(folder, ctx, images):
+    def spoil(planes):
+        planes["G"][8, 8] = 65504.0
+
+    rewrite_view(folder, 2, spoil)
+    views = run(folder, config=GenerationConfig(), ctx=ctx)
+    assert [event["kind"] for event in repairs(ctx)] == ["non_finite_pixels"]
+    assert float(views.radiance.max()) == float(images["radiance"].max())
+
+
 def test_many_non_finite_pixels_are_refused(folder, ctx):
     def spoil(planes):
         planes["basecolor.R"][4, :4] = math.nan

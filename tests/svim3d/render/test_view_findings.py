@@ -20,7 +20,7 @@ def images(cameras):
     normal = images["normal_world"]
     view, row, column = torch.meshgrid(*map(torch.arange, normal.shape[:3]), indexing="ij")
     patch = ((row // 3 + column // 3 + view) % 2)[..., None]
-    colour = torch.where(patch == 0, 0.6, 0.2) * torch.tensor([1.0, 0.6, 0.4])
+    colour = torch.where(patch == 0, 0.9, 0.45) * torch.tensor([1.0, 0.7, 0.5])
     images["basecolor"] = colour * images["mask"]
     # A little relief, so that no two pixels are equally bright.
     shading = 0.5 + 0.3 * normal[..., 1:2] + 0.1 * normal[..., :1]
@@ -59,6 +59,13 @@ def test_clipped_highlights_are_told(cameras, images):
     assert kinds(cameras, images | {"radiance": images["radiance"].clamp_max(limit)}) == [
         "clipped_highlights"
     ]
+
+
+def test_sparkles_are_told(cameras, images):
+    spoilt = images["radiance"].clone()
+    spoilt[3, 20, 20] = 5000.0
+    (message,) = (m for k, m in view_findings(cameras, images | {"radiance": spoilt}))
+    assert message.startswith("1 pixels are up to")
 
 
 def test_darkness_and_mirrors_are_told(cameras, images):
