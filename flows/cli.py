@@ -26,6 +26,7 @@ from flows.operator_options import (
 )
 from flows.options import edit_options, job_options, relight_options
 from flows.serve_options import serve_options
+from flows.stability_options import stability_options
 from flows.train_options import train_options
 
 DONE, FAILED, BAD_INPUT, CANCELLED = 0, 1, 2, 130
@@ -45,6 +46,7 @@ DOERS = {
     "resume": "flows.runs",
     "logs": "flows.runs",
     "store": "flows.store",
+    "stability": "flows.stability",
 }
 
 # Thread pools that spin while they wait starve each other: two of them on two cores made the
@@ -141,6 +143,7 @@ def _parser() -> argparse.ArgumentParser:
             "do what a Prefect server, or HTTP, asks for",
         ),
         ("automations", [shared], "let a Prefect server find and resume runs that were killed"),
+        ("stability", [stability_options(), shared], "run the suite of hazards, and report"),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
     ):

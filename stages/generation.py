@@ -26,6 +26,7 @@ from svim3d.io.scene import read_object
 from svim3d.mesh.source_mesh import SourceMesh, normalised
 from svim3d.render.deferred import environment_shader
 from svim3d.render.pictures import render_pictures
+from svim3d.render.view_findings import view_findings
 from svim3d.shading.octahedral import texel_directions
 from svim3d.shading.studio import studio_radiance
 
@@ -48,18 +49,29 @@ def run(
             "check the path"
         )
     try:
-        if prepared is not None:
-            # The diffusion libraries take seconds to import, and only photos need them.
-            from stages.orbit_drawing import views_of_photo
-
-            return views_of_photo(prepared, config=config, ctx=ctx)
-        if source.is_dir():
-            return _from_orbit(source, ctx)
-        return _from_mesh(normalised(read_object(source), source.name), config, ctx)
+        views = _views(source, prepared, config, ctx)
     except InputError:
         raise
     except ValueError as error:
         raise InputError(str(error)) from error
+    images = {name: image for name, image in vars(views).items() if isinstance(image, Tensor)}
+    for kind, message in view_findings(views.cameras, images):
+        ctx.event(kind, message)
+    return views
+
+
+def _views(
+    source: Path, prepared: PreparedPhoto | None, config: GenerationConfig, ctx: Context
+) -> MaterialViews:
+    """Drawn of a photo, read from a folder, or rendered."""
+    if prepared is not None:
+        # The diffusion libraries take seconds to import, and only photos need them.
+        from stages.orbit_drawing import views_of_photo
+
+        return views_of_photo(prepared, config=config, ctx=ctx)
+    if source.is_dir():
+        return _from_orbit(source, ctx)
+    return _from_mesh(normalised(read_object(source), source.name), config, ctx)
 
 
 def _from_orbit(folder: Path, ctx: Context) -> MaterialViews:

@@ -34,6 +34,11 @@ MARGIN, LABEL_WIDTH, HEADER = 8, 104, 36  # pixels
 TEXT_PX, TITLE_PX = 13, 15
 AIR = 1.06  # pictures are cropped to the object and this much around it
 MIN_COVERAGE = 0.5  # pixels that the object mostly covers are compared
+# Beyond these an asset is told not to be what the views show. Assets of true views keep within
+# them: at worst 20 dB of radiance (shadows are not rendered), 26 of basecolor, 23 of metallic, 5.6
+# degrees and an overlap of 0.96.
+LEAST_DB = {"radiance": 18.0, "basecolor": 25.0, "roughness": 12.0, "metallic": 12.0}
+MOST_ANGLE_DEG, LEAST_OVERLAP = 9.0, 0.95
 
 Images = dict[str, Float[Tensor, "_ _ _ _"]]  # [views, rows, columns, channels]
 
@@ -95,6 +100,12 @@ def run(
         "normal_world": views.normal_world[chosen],
     }
     figures = compare(rendered, given)
+    if doubts := doubts_of(figures):
+        ctx.event(
+            "views_disagree",
+            f"the asset does not show what the views do: {', '.join(doubts)}; they contradict each "
+            "other, or hold what it cannot represent",
+        )
     return PreviewSheet(_sheet(given, rendered, light, figures, chosen, config), figures)
 
 
@@ -134,6 +145,20 @@ def compare(rendered: Images, given: Images) -> dict[str, float]:
     figures["normal_angle_deg"] = mean_angle_deg(*normals, covered)
     figures["mask_iou"] = float((covered & also).sum() / (covered | also).sum().clamp_min(1))
     return figures
+
+
+def doubts_of(figures: dict[str, float]) -> list[str]:
+    """Figures of `compare` that no asset of sound views has, in words."""
+    doubts = [
+        f"{name} {figures[f'{name}_psnr_db']:.1f} dB"
+        for name, least in LEAST_DB.items()
+        if not figures[f"{name}_psnr_db"] >= least
+    ]
+    if not figures["normal_angle_deg"] <= MOST_ANGLE_DEG:
+        doubts.append(f"normals {figures['normal_angle_deg']:.1f} deg")
+    if not figures["mask_iou"] >= LEAST_OVERLAP:
+        doubts.append(f"outlines overlap by {figures['mask_iou']:.0%}")
+    return doubts
 
 
 def _sheet(

@@ -14,6 +14,7 @@ from svim3d.render.view_warps import ViewCorrections
 
 TOLD_WEIGHT = 0.7  # of a view; a lower one is told
 TOLD_LIMIT = 0.99  # share of the largest corner shift; a warp beyond it is told as bound
+TOLD_MOTION = 0.005  # of the picture, mean over views and corners; true views stay below 0.002
 FACING = "facing"  # name of the plane that holds the trust by angle
 MIN_MASKS = 8  # of fewer, each has to carve what the others leave
 LEAST_TAKEN = 0.04  # of a hull: shifted views take as much, and their homographies mend them
@@ -103,13 +104,21 @@ def view_terms(aligned: AlignedViews) -> dict[str, float]:
 
 
 def tell_of_views(aligned: AlignedViews, ctx: Context) -> None:
-    """Name the views that were held against the others, and the warps that ran into their bound."""
+    """Name views that were held against the others, and warps that are large or at their bound."""
     for view in torch.nonzero(aligned.weights < TOLD_WEIGHT)[:, 0].tolist():
         ctx.event(
             "view_outvoted",
             f"view {view} disagrees with the others: it counts {float(aligned.weights[view]):.2f}",
         )
-    largest = aligned.corrections.shifts.norm(dim=-1).amax(1)
+    motion = aligned.corrections.shifts.norm(dim=-1)
+    mean, most = (0.5 * float(value) for value in (motion.mean(), motion.max()))
+    if mean > TOLD_MOTION:
+        ctx.event(
+            "views_bent",
+            f"the views do not fit together as they are: they were moved by {mean:.1%} of the "
+            f"picture on average, by {most:.1%} at most",
+        )
+    largest = motion.amax(1)
     bound = torch.nonzero(largest > TOLD_LIMIT * aligned.alignment.limit)[:, 0].tolist()
     if bound:
         ctx.event("warp_bound", f"the homographies of views {bound} have reached their bound")

@@ -14,6 +14,7 @@ log = logging.getLogger(__name__)
 
 MAX_NON_FINITE_SHARE = 0.01  # of a view's pixels; more than a few is a broken render
 MAX_NORMAL_LENGTH_ERROR = 0.01  # half-float rounding stays below 0.001
+LARGEST_HALF = 65504.0  # what writers of half floats make of infinity
 MIN_VIEWS = 3  # two silhouettes leave the depth of almost every point open
 OBJECT_HALF_EXTENT = 0.5  # the object's longest side is 1, centred
 MAX_SHARE_OUTSIDE = 0.01  # of covered pixels that look past the object's cube
@@ -32,7 +33,8 @@ def _log(kind: str, message: str) -> None:
 def repair_images(images: Images, names: Sequence[str], notify: Notify | None) -> Images:
     """Bring every value into its range; valid images pass through bit for bit.
 
-    Few non-finite pixels take the nearest finite pixel's values, negative radiance becomes zero,
+    Few pixels that are not finite, or as bright as a half float can be, take the values of the
+    nearest that is; negative radiance becomes zero,
     coverage and materials are clamped to [0, 1], normals of wrong length are rescaled, depths that
     are no distance become zero.
 
@@ -64,6 +66,8 @@ def _fill_non_finite(images: Images, view: int, name: str, notify: Notify) -> No
     # Renderers write infinity for the depth of the background.
     needed = [image for key, image in images.items() if key != "depth"]
     bad = torch.stack([~torch.isfinite(i[view]).all(-1) for i in needed]).any(0)
+    if "radiance" in images:
+        bad |= (images["radiance"][view] >= LARGEST_HALF).any(-1)
     count = int(bad.sum())
     if not count:
         return

@@ -5,7 +5,7 @@ import torch
 from sphere_orbit import sphere_cameras, sphere_images
 
 from stages.artifacts import ExportedAsset, FittedField, MaterialViews
-from stages.preview import INK, PAPER, TEXT_PX, PreviewSheet, run
+from stages.preview import INK, PAPER, TEXT_PX, PreviewSheet, doubts_of, run
 from stages.settings.preview import PreviewConfig
 from svim3d.fields.material_field import MaterialFieldSpec
 from svim3d.io.exr import write_rgb
@@ -119,3 +119,25 @@ def test_round_trip_and_same_bytes(views, field, ctx, tmp_path):
     for file in ("preview.png", "metrics.json"):
         content = {(tmp_path / name / file).read_bytes() for name in "abc"}
         assert len(content) == 1
+
+
+def test_an_asset_of_its_views_is_not_doubted(views, field, ctx):
+    run(views, field, asset(), config=TINY, ctx=ctx)
+    doubted = [e for e in ctx.events if e["kind"] == "views_disagree"]
+    # The flat light of the test is not that of the views: radiance alone may be off.
+    assert all("radiance" in e["message"] and "normals" not in e["message"] for e in doubted)
+
+
+def test_an_asset_that_shows_something_else_is_told(views, field, ctx):
+    run(views, field, asset(radius=0.4, basecolor=(0.1, 0.8, 0.1)), config=TINY, ctx=ctx)
+    (message,) = [e["message"] for e in ctx.events if e["kind"] == "views_disagree"]
+    assert "basecolor" in message and "outlines overlap by" in message
+    assert "metallic" not in message
+
+
+def test_figures_that_are_no_numbers_are_doubted():
+    sound = {f"{name}_psnr_db": 40.0 for name in ("radiance", "basecolor", "roughness", "metallic")}
+    sound |= {"normal_angle_deg": 1.0, "mask_iou": 0.99}
+    assert doubts_of(sound) == []
+    assert doubts_of(sound | {"radiance_psnr_db": math.nan}) == ["radiance nan dB"]
+    assert doubts_of(sound | {"mask_iou": math.nan}) == ["outlines overlap by nan%"]

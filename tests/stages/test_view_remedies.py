@@ -38,6 +38,17 @@ def test_views_that_agree_are_not_mentioned(make_context):
     assert ctx.events == []
 
 
+def test_views_that_had_to_be_moved_far_are_told(make_context):
+    shifts = torch.zeros(4, 4, 2)
+    shifts[0, :, 0] = 0.08
+    ctx = make_context("nerf")
+    view_remedies.tell_of_views(aligned(shifts, torch.ones(4)), ctx)
+    ((kind, message),) = (tuple(event.values()) for event in ctx.events)
+    assert kind == "views_bent"
+    # 0.08 half pictures in one view of four.
+    assert "moved by 1.0% of the picture on average, by 4.0% at most" in message
+
+
 def test_figures_are_in_pixels():
     shifts = torch.zeros(4, 4, 2)
     shifts[0] = torch.tensor([3.0, 4.0]) / 100
