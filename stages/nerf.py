@@ -17,7 +17,8 @@ from stages import view_remedies
 from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
 from stages.base import Context, Stage
 from stages.errors import InputError
-from stages.nerf_terms import ray_terms
+from stages.nerf_terms import ray_terms, shown_loss
+from stages.plateau import Plateau
 from stages.prefilter_cache import cached_operator
 from stages.settings.nerf import NerfConfig
 from svim3d.cameras import Cameras
@@ -32,7 +33,8 @@ from svim3d.render.hull import INSIDE_COVERAGE, coverage_votes
 from svim3d.render.march import hits_surface
 from svim3d.render.pixel_blocks import PIXELS, PixelBlocks
 from svim3d.render.volumes import DensityVolume, SdfVolume
-from svim3d.render.volumetric import render_rays
+from svim3d.render.volumetric import Rendered, render_rays
+from svim3d.shading.prefilter import EnvironmentPyramid
 
 log = logging.getLogger(__name__)
 
@@ -229,13 +231,46 @@ def _draw(blocks: PixelBlocks, step: int, config: NerfConfig, ctx: Context) -> P
     return blocks.take(order[place * count : (place + 1) * count].to(ctx.device))
 
 
+def _render(
+    fit: _Fit,
+    batch: PixelBlocks,
+    jitter: Tensor,
+    pyramid: EnvironmentPyramid,
+    step: int,
+    config: NerfConfig,
+) -> Rendered:
+    """What a batch shows of the fit."""
+    return render_rays(
+        fit.volume,
+        fit.materials,
+        batch.rays(),
+        jitter=jitter,
+        pyramid=pyramid,
+        min_weight=config.min_weight,
+        use_bump=step >= config.bump_start * config.steps,
+        multiple_scattering=config.multiple_scattering,
+    )
+
+
+@torch.no_grad()
+def _held_out_loss(
+    fit: _Fit, blocks: PixelBlocks, pyramid: EnvironmentPyramid, step: int, config: NerfConfig
+) -> float:
+    """How far pixels that were never fitted are from the views, whatever the schedule weighs."""
+    jitter = torch.full((blocks.pixels.numel(),), 0.5, device=blocks.pixels.device)
+    rendered = _render(fit, blocks, jitter, pyramid, step, config)
+    return shown_loss(rendered, blocks, fit.log_environment, config)
+
+
 def _optimise(
     fit: _Fit, blocks: PixelBlocks, aligned: AlignedViews | None, config: NerfConfig, ctx: Context
 ) -> None:
     """The loop. State is saved where the empty-space grid is a function of the parameters."""
     operator = cached_operator(ctx.shared, len(fit.log_environment))
-    first = _resume(fit, aligned, config, ctx)
-    for step in range(first, config.steps):
+    plateau = Plateau.of(config, config.grid_shares, window=REFRESH_EVERY)
+    held_out, blocks = plateau.held_out(blocks, ctx)
+    step = _resume(fit, aligned, plateau, config, ctx)
+    while step < config.steps:
         warped = aligned if step >= config.warp_start * config.steps else None
         if step % REFRESH_EVERY == 0:
             _grow_if_due(fit, step, config)
@@ -243,25 +278,20 @@ def _optimise(
                 view_remedies.realign(warped, step / config.steps, config)
             if ctx.checkpoints.due():
                 learnt = {} if aligned is None else aligned.state()
-                buffers = dict(fit.volume.named_buffers())
-                ctx.checkpoints.save(step, fit.adam.state() | buffers | learnt)
+                learnt |= plateau.state() | dict(fit.volume.named_buffers())
+                ctx.checkpoints.save(step, fit.adam.state() | learnt)
             if isinstance(fit.volume, SdfVolume):
                 fit.volume.sharpness = _sharpness_at(step / config.steps, config)
             fit.volume.refresh(generator=ctx.generator(f"refresh {step}"))
+        pyramid = operator(fit.log_environment.exp())
+        if plateau.is_watched and step % REFRESH_EVERY == 0:
+            shown = held_out if warped is None else _read_through(warped, held_out)
+            plateau.observe(step, _held_out_loss(fit, shown, pyramid, step, config))
         batch = _draw(blocks, step, config, ctx)
         if warped is not None:
-            batch = batch.showing(warped.targets(batch.pixels))
+            batch = _read_through(warped, batch)
         jitter = torch.rand(batch.pixels.numel(), generator=ctx.generator(f"jitter {step}"))
-        rendered = render_rays(
-            fit.volume,
-            fit.materials,
-            batch.rays(),
-            jitter=jitter.to(ctx.device),
-            pyramid=operator(fit.log_environment.exp()),
-            min_weight=config.min_weight,
-            use_bump=step >= config.bump_start * config.steps,
-            multiple_scattering=config.multiple_scattering,
-        )
+        rendered = _render(fit, batch, jitter.to(ctx.device), pyramid, step, config)
         if warped is not None:
             warped.observe(batch.pixels, rendered.surface_images(), batch.targets)
         terms = ray_terms(
@@ -281,6 +311,13 @@ def _optimise(
         if warped is not None and step % REFRESH_EVERY == 0:
             told |= view_remedies.view_terms(warped)
         ctx.report(step + 1, config.steps, told)
+        step = plateau.after(step, ctx)
+    plateau.tell(ctx)
+
+
+def _read_through(aligned: AlignedViews, batch: PixelBlocks) -> PixelBlocks:
+    """A batch with what its views show where they are read through their warps."""
+    return batch.showing(aligned.targets(batch.pixels))
 
 
 def _grow_if_due(fit: _Fit, step: int, config: NerfConfig) -> None:
@@ -293,7 +330,13 @@ def _grow_if_due(fit: _Fit, step: int, config: NerfConfig) -> None:
         fit.grow(nodes, config)
 
 
-def _resume(fit: _Fit, aligned: AlignedViews | None, config: NerfConfig, ctx: Context) -> int:
+def _resume(
+    fit: _Fit,
+    aligned: AlignedViews | None,
+    plateau: Plateau,
+    config: NerfConfig,
+    ctx: Context,
+) -> int:
     """Take up a checkpoint; returns the step to go on with."""
     saved = ctx.checkpoints.load()
     if saved is None:
@@ -307,6 +350,7 @@ def _resume(fit: _Fit, aligned: AlignedViews | None, config: NerfConfig, ctx: Co
         buffer.copy_(tensors[name])
     if aligned is not None:
         aligned.load_state(tensors)
+    plateau.load_state(tensors)
     log.info("nerf: resumed at step %d", step)
     return step
 
