@@ -85,6 +85,7 @@ def run(
         prior=config.fit_prior,
         iterations=max(config.fit_iterations, JUDGED_ITERATIONS),
         sharpened=config.fit_iterations,
+        lost_db=config.materials_lost_db,
     )
     corrections = fitted.corrections if config.correct_views else None
     pixels_at = cache(lambda size: _seen(mesh, size, views, corrections))
