@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from stages import view_remedies
 from stages.artifacts import FittedField, MaterialViews, RefinedSurface
 from stages.base import Context, Stage
+from stages.capacity_plan import CapacityPlan, bounded
 from stages.errors import DivergenceError, InputError
 from stages.plateau import Plateau
 from stages.prefilter_cache import cached_operator
@@ -309,16 +310,18 @@ def _optimise(
 def run(
     views: MaterialViews,
     field: FittedField,
+    plan: CapacityPlan | None = None,
     *,
     config: DmtetConfig,
     ctx: Context,
 ) -> RefinedSurface:
-    """Refine phase 1's surface on the views.
+    """Refine phase 1's surface on the views; with a plan sizes are upper bounds.
 
     Raises:
         InputError: the field has no surface.
         DivergenceError: the surface vanished, or too many steps were not finite.
     """
+    config = bounded(config, plan, ctx)
     cameras, planes = views.premultiplied(config.image_size)
     cameras = cameras.to(ctx.device)
     planes = {name: plane.to(ctx.device) for name, plane in planes.items()}

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from stages import view_remedies
 from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
 from stages.base import Context, Stage
+from stages.capacity_plan import CapacityPlan, bounded
 from stages.errors import InputError
 from stages.nerf_terms import ray_terms, shown_loss
 from stages.plateau import Plateau
@@ -358,16 +359,18 @@ def _resume(
 def run(
     views: MaterialViews,
     environment: EnvironmentLight | None,
+    plan: CapacityPlan | None = None,
     *,
     config: NerfConfig,
     ctx: Context,
 ) -> FittedField:
-    """Fit a field to the views.
+    """Fit a field to the views; with a plan sizes are upper bounds.
 
     Raises:
         InputError: fewer than three views, an empty mask, or masks that share no point.
     """
     _check(views)
+    config = bounded(config, plan, ctx)
     cameras, planes = views.premultiplied(config.image_size)
     cameras = cameras.to(ctx.device)
     planes = {name: plane.to(ctx.device) for name, plane in planes.items()}

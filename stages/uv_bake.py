@@ -19,6 +19,7 @@ from torch import Tensor
 
 from stages.artifacts import FittedField, MaterialViews, RefinedSurface, TexturedMesh
 from stages.base import Context, Stage
+from stages.capacity_plan import CapacityPlan, bounded
 from stages.errors import InputError
 from stages.settings.uv_bake import UvBakeConfig
 from svim3d.mesh.atlas import unwrap
@@ -45,15 +46,19 @@ def run(
     views: MaterialViews,
     field: FittedField,
     surface: RefinedSurface | None,
+    plan: CapacityPlan | None = None,
     *,
     config: UvBakeConfig,
     ctx: Context,
 ) -> TexturedMesh:
     """Bake the field onto a mesh and sharpen its textures against the views.
 
+    With a plan sizes are upper bounds.
+
     Raises:
         InputError: there is no surface to bake.
     """
+    config = bounded(config, plan, ctx)
     fitted = surface if surface is not None else field.own_surface()
     fine = clean_surface(
         fitted.vertices,

@@ -31,6 +31,7 @@ TIER_1 = tuple(f"svim3d.{name}" for name in MIDDLE)
 CONTRACT = (
     "stages.base",
     "stages.artifacts",
+    "stages.capacity_plan",
     "stages.photo_artifact",
     "stages.orbit_drawing",
     "stages.errors",
@@ -54,6 +55,7 @@ MAY_IMPORT = {
     "stages.errors": (),
     "stages.base": ("svim3d", "stages.errors"),
     "stages.artifacts": ("svim3d",),
+    "stages.capacity_plan": ("svim3d", "stages.base", "stages.settings"),
     "stages.photo_artifact": ("svim3d",),
     "stages.orbit_drawing": ("svim3d", *CONTRACT),
     "stages.keys": ("stages.errors",),
