@@ -12,6 +12,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from stages.errors import InputError
+from stages.settings.capacity import CapacityConfig
 from stages.settings.dmtet import DmtetConfig
 from stages.settings.env_preopt import EnvPreoptConfig
 from stages.settings.export import ExportConfig
@@ -22,7 +23,7 @@ from stages.settings.preview import PreviewConfig
 from stages.settings.relight import RelightConfig
 from stages.settings.uv_bake import UvBakeConfig
 
-PRESETS = ("preview", "standard", "paper")  # from quick to thorough
+PRESETS = ("preview", "standard", "paper", "auto")  # from quick to thorough, and what is needed
 ABOUT = "about"  # the one key of a preset file that is no setting: a line for `svim3d presets`
 NEAREST_NAMES = 3
 
@@ -38,9 +39,13 @@ class RunConfig(BaseModel):
 class PipelineConfig(RunConfig):
     """Settings of all stages from photo to asset."""
 
+    skip: frozenset[str] = Field(
+        frozenset({"capacity"}), description="stages to leave out; preset `auto` has them all"
+    )
     prepare: PrepareConfig = PrepareConfig()
     # Made when it is needed: it digests the files of a model.
     generation: GenerationConfig = Field(default_factory=GenerationConfig)
+    capacity: CapacityConfig = CapacityConfig()
     env_preopt: EnvPreoptConfig = EnvPreoptConfig()
     nerf: NerfConfig = NerfConfig()
     dmtet: DmtetConfig = DmtetConfig()
@@ -75,7 +80,7 @@ def load_config(
     """
     values = preset_values(preset)
     _override(schema, values, overrides)
-    left_out = values.get("skip", [])
+    left_out = values.get("skip", sorted(schema.model_fields["skip"].default))
     if not isinstance(left_out, list):
         raise InputError(f"--set skip={left_out}: wanted a list of stages, like skip=[dmtet]")
     values["skip"] = [*left_out, *skip]

@@ -31,8 +31,8 @@ from stages.errors import InputError
 PATH = r"^/[^\x00]*$"
 Folder = Annotated[str, Field(pattern=PATH)]
 Input = Annotated[str, Field(pattern=rf"{PATH}|^(example|photo)$")]
-Preset = Literal["preview", "standard", "paper"]
-Skippable = Literal["env_preopt", "dmtet", "uv_bake", "preview"]
+Preset = Literal["preview", "standard", "paper", "auto"]
+Skippable = Literal["capacity", "env_preopt", "dmtet", "uv_bake", "preview"]
 Device = Literal["auto", "cpu", "cuda"]
 Setting = Annotated[str, Field(pattern=r"^\s*[a-z][a-z0-9_.]*\s*=")]
 Limit = Annotated[str, Field(pattern=r"^([a-z_]+=)?[0-9.]+$")]

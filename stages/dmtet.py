@@ -17,8 +17,10 @@ from torch import Tensor, nn
 from stages import view_remedies
 from stages.artifacts import FittedField, MaterialViews, RefinedSurface
 from stages.base import Context, Stage
+from stages.capacity_plan import CapacityPlan, bounded
 from stages.errors import DivergenceError, InputError
 from stages.perceptual_terms import PerceptualTerm
+from stages.plateau import Plateau
 from stages.prefilter_cache import cached_operator
 from stages.settings.dmtet import DmtetConfig
 from svim3d.cameras import Cameras
@@ -48,6 +50,7 @@ WARM_UP = 10  # steps over which the rates rise, while Adam's moments fill
 SIGN_CHANGE_SHARE = 0.25  # share of the steps over which its weight falls; Source: nvdiffrec
 SDF_EPS = 1e-8  # nodes that no view sees get gradients near zero and must stay where they are
 SPARSE = 3  # one in so many pixels of a view aligns it: enough, and a third of the time
+SHOWN = ("mask", "basecolor", "orm", "normal")  # terms that say how well a view is shown
 ENVIRONMENT_EPS = 1e-8  # texels that nothing reflects keep the light they started with
 
 
@@ -276,18 +279,22 @@ def _optimise(
 ) -> None:
     """The loop."""
     operator = cached_operator(ctx.shared, fit.environment.shape[0])
+    # A window holds every view at least once, so that windows compare the same pictures.
+    epoch = -(-len(cameras) // config.views_per_step)
+    plateau = Plateau.of(config, window=epoch)
     saved = ctx.checkpoints.load()
-    first = 0
+    step = 0
     if saved is not None:
-        first, tensors = saved
+        step, tensors = saved
         fit.adam.load_state(tensors)
+        plateau.load_state(tensors)
         if aligned is not None:
             aligned.load_state(tensors)
-        log.info("dmtet: resumed at step %d", first)
-    for step in range(first, config.steps):
+        log.info("dmtet: resumed at step %d", step)
+    while step < config.steps:
         if ctx.checkpoints.due():
             learnt = {} if aligned is None else aligned.state()
-            ctx.checkpoints.save(step, fit.adam.state() | learnt)
+            ctx.checkpoints.save(step, fit.adam.state() | plateau.state() | learnt)
         terms = _step_losses(
             fit, operator, cameras, planes, aligned, perceptual, step=step, config=config, ctx=ctx
         )
@@ -297,21 +304,30 @@ def _optimise(
             if ctx.is_finite(step, fit.adam.gradients()):
                 warm = min(1.0, (step + 1) / WARM_UP)
                 fit.adam.step(config.final_rate ** (step / config.steps) * warm)
+            plateau.observe(step, sum(float(terms[name].detach()) for name in SHOWN))
         told = {name: float(t.detach()) for name, t in terms.items()}
         if aligned is not None:
             told |= view_remedies.view_terms(aligned)
         ctx.report(step + 1, config.steps, told)
+        step = plateau.after(step, ctx)
+    plateau.tell(ctx)
 
 
 def run(
-    views: MaterialViews, field: FittedField, *, config: DmtetConfig, ctx: Context
+    views: MaterialViews,
+    field: FittedField,
+    plan: CapacityPlan | None = None,
+    *,
+    config: DmtetConfig,
+    ctx: Context,
 ) -> RefinedSurface:
-    """Refine phase 1's surface on the views.
+    """Refine phase 1's surface on the views; with a plan sizes are upper bounds.
 
     Raises:
         InputError: the field has no surface.
         DivergenceError: the surface vanished, or too many steps were not finite.
     """
+    config = bounded(config, plan, ctx)
     cameras, planes = views.premultiplied(config.image_size)
     cameras = cameras.to(ctx.device)
     planes = {name: plane.to(ctx.device) for name, plane in planes.items()}

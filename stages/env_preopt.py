@@ -22,6 +22,7 @@ from torch import Tensor
 
 from stages.artifacts import EnvironmentLight, MaterialViews
 from stages.base import Context, Stage
+from stages.capacity_plan import CapacityPlan, bounded
 from stages.errors import InputError
 from stages.prefilter_cache import cached_operator
 from stages.settings.env_preopt import EnvPreoptConfig
@@ -36,12 +37,19 @@ MIN_RADIANCE = 1e-6  # keeps the logarithm of the starting light finite for blac
 ADAM_BETAS = (0.9, 0.95)  # the second moment forgets in 20 of 200 steps, as log radiance settles
 
 
-def run(views: MaterialViews, *, config: EnvPreoptConfig, ctx: Context) -> EnvironmentLight:
-    """Fit the environment to all views.
+def run(
+    views: MaterialViews,
+    plan: CapacityPlan | None = None,
+    *,
+    config: EnvPreoptConfig,
+    ctx: Context,
+) -> EnvironmentLight:
+    """Fit the environment to all views; with a plan its size is an upper bound.
 
     Raises:
         InputError: no pixel is covered and seen from the front.
     """
+    config = bounded(config, plan, ctx)
     pixels = _usable_pixels(views, config, ctx)
     radiance = pixels.pop("radiance").to(ctx.device)
     trust = pixels.pop("confidence").to(ctx.device) if "confidence" in pixels else None

@@ -17,10 +17,12 @@ from torch import Tensor, nn
 from stages import view_remedies
 from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
 from stages.base import Context, Stage
+from stages.capacity_plan import CapacityPlan, bounded
 from stages.errors import InputError
 from stages.nerf_hull import start_hull
-from stages.nerf_terms import ray_terms
+from stages.nerf_terms import ray_terms, shown_loss
 from stages.perceptual_terms import PerceptualTerm
+from stages.plateau import Plateau
 from stages.prefilter_cache import cached_operator
 from stages.settings.nerf import NerfConfig
 from svim3d.cameras import Cameras
@@ -232,8 +234,10 @@ def _optimise(
 ) -> None:
     """The loop. State is saved where the empty-space grid is a function of the parameters."""
     operator = cached_operator(ctx.shared, len(fit.log_environment))
-    first = _resume(fit, aligned, config, ctx)
-    for step in range(first, config.steps):
+    plateau = Plateau.of(config, config.grid_shares, window=REFRESH_EVERY)
+    held_out, blocks = plateau.held_out(blocks, ctx)
+    step = _resume(fit, aligned, plateau, config, ctx)
+    while step < config.steps:
         warped = aligned if step >= config.warp_start * config.steps else None
         if step % REFRESH_EVERY == 0:
             _grow_if_due(fit, step, config)
@@ -241,16 +245,19 @@ def _optimise(
                 view_remedies.realign(warped, step / config.steps, config)
             if ctx.checkpoints.due():
                 learnt = {} if aligned is None else aligned.state()
-                buffers = dict(fit.volume.named_buffers())
-                ctx.checkpoints.save(step, fit.adam.state() | buffers | learnt)
+                learnt |= plateau.state() | dict(fit.volume.named_buffers())
+                ctx.checkpoints.save(step, fit.adam.state() | learnt)
             if isinstance(fit.volume, SdfVolume):
                 fit.volume.sharpness = _sharpness_at(step / config.steps, config)
             fit.volume.refresh(generator=ctx.generator(f"refresh {step}"))
-        batch = _draw(blocks, step, config, ctx)
-        if warped is not None:
-            batch = batch.showing(warped.targets(batch.pixels))
-        light = operator(fit.log_environment.exp())
-        render = partial(_render, fit, light, step=step, config=config, ctx=ctx)
+        pyramid = operator(fit.log_environment.exp())
+        render = partial(_render, fit, pyramid, step=step, config=config, ctx=ctx)
+        if plateau.is_watched and step % REFRESH_EVERY == 0:
+            shown = _read_through(warped, held_out)
+            with torch.no_grad():
+                seen = render(shown.rays(), "held out")
+            plateau.observe(step, shown_loss(seen, shown, fit.log_environment, config))
+        batch = _read_through(warped, _draw(blocks, step, config, ctx))
         rendered = render(batch.rays(), "jitter")
         if warped is not None:
             warped.observe(batch.pixels, rendered.surface_images(), batch.targets)
@@ -273,6 +280,13 @@ def _optimise(
         if warped is not None and step % REFRESH_EVERY == 0:
             told |= view_remedies.view_terms(warped)
         ctx.report(step + 1, config.steps, told)
+        step = plateau.after(step, ctx)
+    plateau.tell(ctx)
+
+
+def _read_through(aligned: AlignedViews | None, batch: PixelBlocks) -> PixelBlocks:
+    """A batch with what its views show where they are read through their warps, if any."""
+    return batch if aligned is None else batch.showing(aligned.targets(batch.pixels))
 
 
 def _grow_if_due(fit: _Fit, step: int, config: NerfConfig) -> None:
@@ -285,7 +299,13 @@ def _grow_if_due(fit: _Fit, step: int, config: NerfConfig) -> None:
         fit.grow(nodes, config)
 
 
-def _resume(fit: _Fit, aligned: AlignedViews | None, config: NerfConfig, ctx: Context) -> int:
+def _resume(
+    fit: _Fit,
+    aligned: AlignedViews | None,
+    plateau: Plateau,
+    config: NerfConfig,
+    ctx: Context,
+) -> int:
     """Take up a checkpoint; returns the step to go on with."""
     saved = ctx.checkpoints.load()
     if saved is None:
@@ -299,6 +319,7 @@ def _resume(fit: _Fit, aligned: AlignedViews | None, config: NerfConfig, ctx: Co
         buffer.copy_(tensors[name])
     if aligned is not None:
         aligned.load_state(tensors)
+    plateau.load_state(tensors)
     log.info("nerf: resumed at step %d", step)
     return step
 
@@ -306,16 +327,18 @@ def _resume(fit: _Fit, aligned: AlignedViews | None, config: NerfConfig, ctx: Co
 def run(
     views: MaterialViews,
     environment: EnvironmentLight | None,
+    plan: CapacityPlan | None = None,
     *,
     config: NerfConfig,
     ctx: Context,
 ) -> FittedField:
-    """Fit a field to the views.
+    """Fit a field to the views; with a plan sizes are upper bounds.
 
     Raises:
         InputError: fewer than three views, an empty mask, or masks that share no point.
     """
     _check(views)
+    config = bounded(config, plan, ctx)
     cameras, planes = views.premultiplied(config.image_size)
     cameras = cameras.to(ctx.device)
     planes = {name: plane.to(ctx.device) for name, plane in planes.items()}

@@ -12,6 +12,17 @@ from svim3d.render.volumetric import Rendered
 MIN_COVERAGE = 1e-3  # guards the division that turns premultiplied into straight
 
 
+JUDGED = ("basecolor", "orm", "normal")  # terms that say how well views are shown
+
+
+def shown_loss(
+    rendered: Rendered, batch: PixelBlocks, log_environment: Tensor, config: NerfConfig
+) -> float:
+    """How well a batch is shown, by the same weights wherever the schedule is."""
+    terms = ray_terms(rendered, batch, log_environment=log_environment, done=0.0, config=config)
+    return sum(float(terms[name]) for name in JUDGED)
+
+
 def ray_terms(
     rendered: Rendered,
     batch: PixelBlocks,

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from stages.artifacts import FittedField, MaterialViews, RefinedSurface, TexturedMesh
 from stages.base import Context, Stage
+from stages.capacity_plan import CapacityPlan, bounded
 from stages.errors import InputError
 from stages.settings.uv_bake import UvBakeConfig
 from svim3d.mesh.atlas import unwrap
@@ -45,15 +46,19 @@ def run(
     views: MaterialViews,
     field: FittedField,
     surface: RefinedSurface | None,
+    plan: CapacityPlan | None = None,
     *,
     config: UvBakeConfig,
     ctx: Context,
 ) -> TexturedMesh:
     """Bake the field onto a mesh and sharpen its textures against the views.
 
+    With a plan sizes are upper bounds.
+
     Raises:
         InputError: there is no surface to bake.
     """
+    config = bounded(config, plan, ctx)
     fitted = surface if surface is not None else field.own_surface()
     fine = clean_surface(
         fitted.vertices,
@@ -79,13 +84,6 @@ def run(
     openness = _openness(mesh, field, config.occlusion_rays)
     values = torch.cat([values, texels.interpolate(mesh.faces, openness)], 1)
     values, texels = average_down(values, texels, config.supersample)
-    wanted = Wanted(
-        nested=config.materials == "nested",
-        sized=config.texture_sizes == "evidence",
-        prior=config.fit_prior,
-        iterations=max(config.fit_iterations, JUDGED_ITERATIONS),
-        sharpened=config.fit_iterations,
-    )
     corrections = fitted.corrections if config.correct_views else None
     pixels_at = cache(lambda size: _seen(mesh, size, views, corrections))
     if config.fit_iterations:
@@ -93,7 +91,7 @@ def run(
         values = torch.cat([fit, values[:, 5:]], 1)
     surface_values, local, occlusion = values.split([5, 3, 1], 1)
     baked = BakedTexels(surface_values, occlusion, local, mesh, texels)
-    maps = material_maps(baked, pixels_at, views.normal_world, wanted)
+    maps = material_maps(baked, pixels_at, views.normal_world, _wanted(config))
     for name, note in maps.notes.items():
         ctx.event("material", f"{name}: {note}", tell=False)
     ctx.report(4, 4, {"coverage": len(texels.pixel) / texels.size**2})
@@ -104,6 +102,18 @@ def run(
         orm_factor=maps.orm_factor,
         normal_tangent=maps.normal_tangent,
     ).without_needless_seams()
+
+
+def _wanted(config: UvBakeConfig) -> Wanted:
+    """How the settings have the maps made."""
+    return Wanted(
+        nested=config.materials == "nested",
+        sized=config.texture_sizes == "evidence",
+        prior=config.fit_prior,
+        iterations=max(config.fit_iterations, JUDGED_ITERATIONS),
+        sharpened=config.fit_iterations,
+        lost_db=config.materials_lost_db,
+    )
 
 
 def _decimated(

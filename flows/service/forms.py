@@ -9,8 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from flows.service.outcome import Progress
 from flows.service.records import ID_PATTERN, Event, Record, State
 
-Preset = Literal["preview", "standard", "paper"]
-Skippable = Literal["env_preopt", "dmtet", "uv_bake", "preview"]
+Preset = Literal["preview", "standard", "paper", "auto"]
+Skippable = Literal["capacity", "env_preopt", "dmtet", "uv_bake", "preview"]
 # What a form field stands for among all settings; see `svim3d run --help`, `--set`.
 SETTING_OF = {
     "samples": "generation.samples",
@@ -64,7 +64,7 @@ class JobForm(BaseModel):
     texture_size: int | None = Field(None, ge=64, le=4096, description="texels per side")
     max_faces: int | None = Field(None, ge=100, le=100_000, description="of the mesh")
     skip: list[Skippable] = Field(
-        default_factory=list, max_length=4, description="stages to leave out"
+        default_factory=list, max_length=5, description="stages to leave out"
     )
 
     def settings(self) -> dict[str, Any]:

@@ -14,6 +14,10 @@ class DmtetConfig(PerceptualSettings):
 
     steps: PositiveInt = 150
     """Optimiser steps. The paper takes 1500; after phase 1 most of the gain comes early."""
+    least_fall: Share = 0.0
+    """Share by which the loss over all views has to fall from window to window (each view once, or
+    a sixteenth of the steps); where it does not, only the last part of the schedule is left. 0: all
+    steps are made."""
     views_per_step: PositiveInt = 1
     """Views rendered in each step."""
     image_size: PositiveInt = 256

@@ -15,6 +15,9 @@ class NerfConfig(PerceptualSettings):
 
     steps: PositiveInt = 1200
     """Optimiser steps. The paper takes 800 at full image size."""
+    least_fall: Share = 0.0
+    """Share by which the loss of held-out pixels has to fall in each sixteenth of the steps; where
+    it does not, the rest of that part of the schedule is left out. 0: all steps are made."""
     rays_per_step: Annotated[int, Field(ge=64, multiple_of=4)] = 4096
     """Rays of a step, drawn as blocks of 2 x 2 pixels over all views."""
     image_size: PositiveInt = 256

@@ -29,6 +29,11 @@ class UvBakeConfig(StageConfig):
         default="texture",
         description="nested: a constant or a palette where the views do not pay for a texture",
     )
+    materials_lost_db: float = Field(
+        default=100.0,
+        ge=0.0,
+        description="nested: how much farther from held-out pixels than a texture a form may be",
+    )
     texture_sizes: Literal["fixed", "evidence"] = Field(
         default="fixed",
         description="evidence: each map as small as its detail and the views' pixels allow (45 dB)",

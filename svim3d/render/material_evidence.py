@@ -119,7 +119,12 @@ def _named(hypothesis: Hypothesis) -> str:
 
 
 def judge(
-    pixels: ViewPixels, *, texel_count: dict[str, int], prior: float, iterations: int
+    pixels: ViewPixels,
+    *,
+    texel_count: dict[str, int],
+    prior: float,
+    iterations: int,
+    most_lost_db: float = math.inf,
 ) -> dict[str, Verdict]:
     """The form of each group of channels.
 
@@ -128,6 +133,7 @@ def judge(
         texel_count: by group, how many texels a sufficient texture of it has.
         prior: of the texture's fit, see `fit_texels`.
         iterations: of that fit.
+        most_lost_db: see `verdict`.
 
     Returns:
         By group; none where the views are too few to be held against each other.
@@ -162,13 +168,25 @@ def judge(
             mean = float((weight * values[known]).sum() / weight.sum())
             border = borders.get((name, clusters), 0)
             hypotheses.append(_weighed(clusters, mean, independent, texel_count[name], border))
-        verdicts[group.name] = verdict(hypotheses, independent)
+        verdicts[group.name] = verdict(hypotheses, independent, most_lost_db)
     return verdicts
 
 
-def verdict(hypotheses: list[Hypothesis], independent: float) -> Verdict:
-    """The cheapest hypothesis; of equal ones the simplest."""
-    chosen = min(hypotheses, key=lambda h: (h.cost, h.clusters or LARGEST_PALETTE + 1))
+def verdict(
+    hypotheses: list[Hypothesis], independent: float, most_lost_db: float = math.inf
+) -> Verdict:
+    """The cheapest hypothesis; of equal ones the simplest.
+
+    Args:
+        hypotheses: among them a texture.
+        independent: pixels that counted.
+        most_lost_db: those that are farther from held-out pixels than the texture by more are left
+            out, whatever they cost; what is beyond `FLOOR_DB` does not count.
+    """
+    texture = next(h for h in hypotheses if h.form == "texture")
+    least_db = min(texture.error_db, FLOOR_DB) - most_lost_db
+    close = [h for h in hypotheses if min(h.error_db, FLOOR_DB) >= least_db]
+    chosen = min(close, key=lambda h: (h.cost, h.clusters or LARGEST_PALETTE + 1))
     return Verdict(chosen, tuple(h for h in hypotheses if h is not chosen), independent)
 
 

@@ -89,6 +89,7 @@ class Wanted:
         prior: of the textures' fit that the views' halves are compared by, see `fit_texels`.
         iterations: of that fit.
         sharpened: steps of the fit of a texture whose size has changed; 0: none.
+        lost_db: how much farther from held-out pixels than a texture a form may be.
     """
 
     nested: bool
@@ -96,6 +97,7 @@ class Wanted:
     prior: float
     iterations: int
     sharpened: int
+    lost_db: float = math.inf
 
 
 def material_maps(
@@ -180,6 +182,7 @@ class _Maker:
                 texel_count=self._counts,
                 prior=self._wanted.prior,
                 iterations=self._wanted.iterations,
+                most_lost_db=self._wanted.lost_db,
             )
             notes = {name: str(verdict) for name, verdict in verdicts.items()}
             for group in GROUPS:

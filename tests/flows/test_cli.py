@@ -73,7 +73,7 @@ def test_no_command_is_bad_usage(capsys):
 def test_presets_are_listed(capsys):
     assert cli.main(["presets"]) == cli.DONE
     printed = capsys.readouterr().out
-    assert all(preset in printed for preset in ("preview", "standard", "paper"))
+    assert all(preset in printed for preset in ("preview", "standard", "paper", "auto"))
 
 
 def test_doctor_describes_the_machine_and_finds_damage(tmp_path, source, capsys):

@@ -1,5 +1,6 @@
 """The real pipeline, tiny: from an orbit folder to files, from the store, and in part."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -43,9 +44,10 @@ def test_orbit_becomes_an_asset_and_the_second_run_starts_no_engine(
 ):
     out = tmp_path / "out"
     assert command(out) == cli.DONE
-    # There is no photo to prepare.
-    worked = [name for name in IMAGE_TO_ASSET.names if name != "prepare"]
-    assert states(out) == {"prepare": "skipped"} | dict.fromkeys(worked, "computed")
+    # There is no photo to prepare, and only preset `auto` plans its capacity.
+    idle = ("prepare", "capacity")
+    worked = [name for name in IMAGE_TO_ASSET.names if name not in idle]
+    assert states(out) == dict.fromkeys(idle, "skipped") | dict.fromkeys(worked, "computed")
     mesh = the_sphere(out)
     assert mesh.visual.material.baseColorTexture.size == (64, 64)
     assert mesh.visual.material.normalTexture is not None
@@ -67,9 +69,23 @@ def test_without_a_phase_there_is_still_a_textured_asset(engine, command, tmp_pa
     assert command(tmp_path, *(f"--skip={name}" for name in left_out)) == cli.DONE
     assert {name for name, state in states(tmp_path).items() if state == "skipped"} == {
         "prepare",
+        "capacity",
         *left_out,
     }
     assert the_sphere(tmp_path).visual.material.baseColorTexture is not None
+
+
+def test_auto_takes_no_more_than_the_views_ask_for_and_says_so(engine, command, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert command(out, "--preset", "auto") == cli.DONE
+    assert {name for name, state in states(out).items() if state == "skipped"} == {"prepare"}
+    said = " ".join(capsys.readouterr().out.split())
+    # The closing table tells what is used of what the settings allow, stage by stage.
+    assert "hash_finest 48 of 48" in said
+    assert "of 64: " in said
+    plan = json.loads((out / "capacity" / "files" / "capacity.json").read_text())
+    assert {"room_normal_px", "thickness_px", "hull_overlap_0"} <= set(plan["evidence"])
+    the_sphere(out)
 
 
 def test_with_no_phase_but_the_first_vertices_carry_the_colour(engine, command, tmp_path):

@@ -123,6 +123,41 @@ def test_killed_and_resumed_run_ends_with_equal_bytes(
     assert equal(run(views, None, config=config, ctx=resumed), want)
 
 
+def test_a_plateau_leaves_steps_out_and_a_resumed_run_leaves_out_the_same(
+    views, make_context, tmp_path
+):
+    """No loss falls by nine tenths in eight steps: every part of the schedule is cut short."""
+    config = TINY.model_copy(update={"steps": 96, "least_fall": 0.9})
+    whole = make_context("nerf")
+    made = []
+    whole.report = lambda step, *_: made.append(step - 1)
+    want = run(views, None, config=config, ctx=whole)
+    assert made[0] == 0
+    assert made[-1] == 95
+    assert len(want.sdf) == TINY.grid_nodes[-1]
+    notes = [event["kind"] for event in whole.events]
+    assert notes.count("plateau") == 2
+    assert whole.events[-1]["message"].startswith(f"steps {len(made)} of 96")
+    assert len(made) < 90
+
+    class Killed(Exception):
+        pass
+
+    def kill(step, *_):
+        if step > 84:
+            raise Killed
+
+    killed = dataclasses.replace(whole, work=tmp_path / "second", events=[])
+    killed.checkpoints._every_s = 0.0
+    killed.report = kill
+    with pytest.raises(Killed):
+        run(views, None, config=config, ctx=killed)
+    resumed = dataclasses.replace(whole, work=tmp_path / "second", events=[])
+    assert resumed.checkpoints.load()[0] > 48
+    assert equal(run(views, None, config=config, ctx=resumed), want)
+    assert [e for e in resumed.events if e["kind"] == "capacity"] == whole.events[-1:]
+
+
 def test_artifact_survives_the_disk(views, make_context, tmp_path):
     fitted = run(views, None, config=TINY.model_copy(update={"steps": 2}), ctx=make_context("nerf"))
     fitted.save(tmp_path)

@@ -6,7 +6,7 @@ import torch
 from torch.nn import functional
 
 from svim3d.raster.texture import bilinear_taps
-from svim3d.render.material_evidence import GROUPS, cost, judge
+from svim3d.render.material_evidence import GROUPS, Hypothesis, cost, judge, verdict
 from svim3d.render.palettes import (
     border_length,
     growing_palettes,
@@ -204,3 +204,26 @@ def test_borders_and_insides_of_clusters():
     assert not have_insides(labels, seen, 3)
     seen[:, 3:5] = False
     assert border_length(labels, seen) == 0
+
+
+@pytest.mark.parametrize(
+    ("most_lost_db", "form", "lost_db"),
+    [
+        (math.inf, "constant", 6.0),
+        (6.5, "constant", 6.0),
+        (5.0, "palette", 1.0),
+        (0.5, "texture", 0),
+    ],
+)
+def test_what_loses_more_than_may_be_lost_is_left_out(most_lost_db, form, lost_db):
+    """The cheapest form is taken of those that are close enough; beyond 45 dB all are alike."""
+    forms = [
+        Hypothesis("constant", 1, 30.0, -300.0),
+        Hypothesis("palette", 2, 35.0, -200.0),
+        Hypothesis("texture", 0, 36.0, -100.0),
+    ]
+    found = verdict(forms, 500.0, most_lost_db)
+    assert found.chosen.form == form
+    assert found.lost_db == pytest.approx(lost_db)
+    unseen = [Hypothesis("constant", 1, 46.0, -9.0), Hypothesis("texture", 0, 90.0, -1.0)]
+    assert verdict(unseen, 500.0, 0.0).chosen.form == "constant"
