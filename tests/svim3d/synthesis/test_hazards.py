@@ -11,15 +11,11 @@ from svim3d.synthesis.hazards.trials import Darkroom
 
 @pytest.fixture(scope="module")
 def room():
-    return Darkroom(PyramidOperator.build(16), size=32, views=6)
+    return Darkroom(PyramidOperator.build(16), size=24, views=5)
 
 
-TRIALS = [
-    (name, variant)
-    for name, hazard in HAZARDS.items()
-    for variant in hazard.variants
-    if hazard.measured == "asset" and name != "numeric"
-]
+ON_VIEWS = [n for n, h in HAZARDS.items() if h.measured == "asset" and n != "numeric"]
+ONE_OF_EACH_KIND = [v for v in VARIANTS if v.endswith(" huge")]
 
 
 def differing(one, other):
@@ -29,23 +25,21 @@ def differing(one, other):
     return {n for n, i in one.images.items() if not torch.equal(i, other.images[n])}
 
 
-@pytest.mark.parametrize(("name", "variant"), TRIALS)
-def test_severity_changes_what_is_given_and_a_seed_tells_it_all(room, name, variant):
+@pytest.mark.parametrize("name", ON_VIEWS)
+def test_severity_changes_what_is_given_and_a_seed_tells_it_all(room, name):
     hazard = HAZARDS[name]
+    variant = hazard.variants[0]
     harmless = hazard.make(room, hazard.severities[0], 3, variant)
     worst = hazard.make(room, hazard.severities[-1], 3, variant)
     again = hazard.make(room, hazard.severities[-1], 3, variant)
-    other = hazard.make(room, hazard.severities[-1], 4, variant)
-    if (name, variant) != ("topology", "shell"):  # nobody sees the cavity
-        assert differing(harmless, worst)
+    assert differing(harmless, worst)
     assert not differing(worst, again)
-    assert differing(worst, other)
     for trial in (harmless, worst):
         assert all(bool(torch.isfinite(image).all()) for image in trial.images.values())
         assert bool((trial.truth.images["mask"] > 0.5).any())
 
 
-@pytest.mark.parametrize("name", ["misaligned", "outlier", "clipped", "soft-mask", "back-side"])
+@pytest.mark.parametrize("name", ["outlier", "clipped", "soft-mask"])
 def test_the_truth_does_not_know_of_the_hazard(room, name):
     hazard = HAZARDS[name]
     harmless, worst = (hazard.make(room, s, 1, "") for s in (0.0, hazard.severities[-1]))
@@ -56,7 +50,7 @@ def test_the_truth_does_not_know_of_the_hazard(room, name):
         assert torch.equal(image, same)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", [*ONE_OF_EACH_KIND, "radiance nan", "normal_world zero"])
 def test_a_numeric_fault_is_in_one_kind_of_tensor(room, variant):
     hazard = HAZARDS["numeric"]
     sound, spoilt = (hazard.make(room, severity, 0, variant) for severity in (0.0, 2.0))
