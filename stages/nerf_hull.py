@@ -14,7 +14,7 @@ from svim3d.render.hull import INSIDE_COVERAGE, MAX_REJECTIONS, coverage_votes, 
 HULL_NODES = 128  # fine enough for parts of one pixel, and still computed in half a second
 MIN_HULL_NODES = 8  # a hull of fewer nodes is noise
 FURTHER = 2  # masks that may be wrong beside those that were allowed for, if no hull is left
-MAX_MISSED = 0.03  # of the reference's silhouette; more masks overruled fill holes and gaps
+MAX_MISSED = 0.05  # of the reference's silhouette; more masks overruled fill holes and gaps
 
 
 def start_hull(

@@ -10,6 +10,7 @@ from spoilt_views import spoilt, trusted, warned
 
 from stages.artifacts import FittedField, MaterialViews, RefinedSurface
 from stages.base import Stage
+from stages.capacity_plan import CapacityPlan
 from stages.dmtet import DMTET
 from stages.errors import DivergenceError, InputError
 from stages.settings.dmtet import DmtetConfig
@@ -209,5 +210,6 @@ def test_views_with_nan_end_with_the_name_of_the_term(views, field, make_context
 
 def test_the_stage_declares_what_it_reads_and_writes():
     assert isinstance(DMTET, Stage)
-    assert DMTET.inputs == {"views": MaterialViews, "field": FittedField}
+    wanted = {"views": MaterialViews, "field": FittedField, "plan": CapacityPlan}
+    assert DMTET.inputs == wanted
     assert DMTET.output is RefinedSurface

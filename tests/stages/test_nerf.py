@@ -9,6 +9,7 @@ from sphere_orbit import RADIUS, sphere_cameras, sphere_images
 from spoilt_views import spoilt, trusted, warned
 
 from stages.artifacts import EnvironmentLight, FittedField, MaterialViews
+from stages.capacity_plan import CapacityPlan
 from stages.errors import InputError
 from stages.nerf import NERF, run
 from stages.settings.nerf import NerfConfig
@@ -363,5 +364,5 @@ def test_schedule_is_checked():
 
 
 def test_stage_declares_its_inputs():
-    assert list(NERF.inputs.values()) == [MaterialViews, EnvironmentLight]
+    assert list(NERF.inputs.values()) == [MaterialViews, EnvironmentLight, CapacityPlan]
     assert NERF.output is FittedField

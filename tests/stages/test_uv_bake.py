@@ -255,5 +255,5 @@ def test_an_empty_surface_is_an_input_error(ctx):
 
 
 def test_inputs_match_the_pipeline():
-    assert list(UV_BAKE.inputs) == ["views", "field", "surface"]
+    assert list(UV_BAKE.inputs) == ["views", "field", "surface", "plan"]
     assert UV_BAKE.output is TexturedMesh

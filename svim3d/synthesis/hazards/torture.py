@@ -10,6 +10,7 @@ from svim3d.synthesis.shapes import superquadric
 KINDS = ("noisy", "sliver-fan", "non-manifold", "zero-area")
 FACES = (200, 2_000, 20_000, 100_000)  # by severity
 ROUGHNESS = 0.02  # deviation of a noisy vertex, of a body of half side 1: edges turn over
+FLAT_SHARE = 0.3  # of the faces that have no area
 SHARED_BY = 5  # faces on an edge that should have two
 
 
@@ -26,11 +27,10 @@ def torture_mesh(
         return _fan(count)
     if kind == "non-manifold":
         return _with_fins(vertices, faces, dice)
-    flat = vertices.clone()
-    chosen = torch.rand(len(faces), generator=dice.generator) < 0.3
-    # A third of the faces collapses onto an edge, some onto a point.
-    flat[faces[chosen, 2].long()] = flat[faces[chosen, 1].long()]
-    return flat, faces
+    flat = faces.clone()
+    chosen = torch.rand(len(faces), generator=dice.generator) < FLAT_SHARE
+    flat[chosen, 2] = flat[chosen, 1]  # onto an edge
+    return vertices, flat
 
 
 def _ball(count: int) -> tuple[Tensor, Tensor]:

@@ -83,7 +83,7 @@ def test_torture_meshes_are_as_bad_as_they_say(kind):
     )
     topology = Topology.of(vertices, faces)
     if kind == "zero-area":
-        assert float((area == 0.0).float().mean()) == pytest.approx(0.3, abs=0.05)
+        assert float((area < 1e-7).float().mean()) == pytest.approx(0.3, abs=0.05)
     elif kind == "non-manifold":
         assert topology.open_edges > 0
     else:
