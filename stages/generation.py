@@ -26,7 +26,7 @@ from svim3d.io.scene import read_object
 from svim3d.mesh.source_mesh import SourceMesh, normalised
 from svim3d.render.deferred import environment_shader
 from svim3d.render.pictures import render_pictures
-from svim3d.render.view_findings import view_findings
+from svim3d.render.view_findings import SOFT_MASKS, view_findings
 from svim3d.shading.octahedral import texel_directions
 from svim3d.shading.studio import studio_radiance
 
@@ -56,7 +56,8 @@ def run(
         raise InputError(str(error)) from error
     images = {name: image for name, image in vars(views).items() if isinstance(image, Tensor)}
     for kind, message in view_findings(views.cameras, images):
-        ctx.event(kind, message)
+        if prepared is None or kind != SOFT_MASKS:  # nobody can give a generator sharper ones
+            ctx.event(kind, message)
     return views
 
 

@@ -14,6 +14,7 @@ from svim3d.cameras import Cameras
 from svim3d.color import luminance
 from svim3d.numerics import normalize
 
+SOFT_MASKS = "soft_masks"  # kind of the finding
 COVERED = 0.5  # mask above which a pixel counts as the object
 FEW_VIEWS = 7  # fewer leave gaps of more than a right angle on one of two sides
 WIDE_GAP_DEG = 100.0  # between neighbours in azimuth; what faces its middle is seen at 50 degrees
@@ -95,7 +96,7 @@ def _soft(mask: Float[Tensor, "V H W 1"], covered: Bool[Tensor, "V H W"]) -> Ite
     width = int(partial.sum()) / max(rim, 1)
     if width > SOFT_PX:
         yield (
-            "soft_masks",
+            SOFT_MASKS,
             f"masks fade over about {width:.1f} pixels: the outline is uncertain by as much, and "
             "colours along it may hold background; give sharper masks",
         )

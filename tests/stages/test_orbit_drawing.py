@@ -17,6 +17,7 @@ from stages.settings.generation import GenerationConfig
 from svim3d.color import linear_from_srgb
 from svim3d.diffusion.model import MaterialDiffusion
 from svim3d.io.model_folder import BUNDLED
+from svim3d.render.view_findings import SOFT_MASKS, view_findings
 
 PHOTO = sphere_photo(48)
 SIZE, VIEWS = 16, 5
@@ -134,6 +135,13 @@ def test_views_of_a_small_model_are_enlarged_for_the_photo(perfect, draw):
     assert views.mask.shape == (VIEWS, 40, 40, 1)
     assert (views.cameras.height, views.cameras.width) == (40, 40)
     assert draw(photo_view_size=40, keep_photo=False).mask.shape[1] == SIZE
+
+
+def test_nobody_is_told_to_sharpen_masks_that_were_drawn(perfect, draw, make_context):
+    views = draw(photo_view_size=10 * SIZE)
+    images = {name: image for name, image in vars(views).items() if torch.is_tensor(image)}
+    assert SOFT_MASKS in dict(view_findings(views.cameras, images))
+    assert SOFT_MASKS not in {event["kind"] for event in make_context("generation").events}
 
 
 def test_of_several_samples_one_is_kept_with_its_confidence(perfect, draw, make_context, tmp_path):
