@@ -31,16 +31,27 @@ def start_hull(
     """
     masks = view_remedies.silhouettes(cameras, planes, reference, config, ctx)[..., 0]
     matrices = cameras.clip_from_world()
+
+    def votes(views: slice, rejections: int) -> Tensor:
+        return coverage_votes(
+            masks[views],
+            matrices[views],
+            nodes=HULL_NODES,
+            half_extent=config.half_extent,
+            rejections=rejections,
+        )
+
+    own = slice(reference, reference + 1)
+    vouched = votes(own, 0)
     most = min(MAX_REJECTIONS, len(cameras) - 2)
     asked = config.hull_rejections
     is_open = asked == "auto"
     allowed = 0 if asked == "auto" else min(asked, most)
     last = most if is_open else min(allowed + FURTHER, most)
     for rejections in range(allowed, last + 1):
-        inside = _inside(masks, matrices, reference, rejections, config.half_extent)
+        inside = torch.minimum(votes(slice(None), rejections), vouched) >= INSIDE_COVERAGE
         if int(inside.sum()) < MIN_HULL_NODES:
             continue
-        own = slice(reference, reference + 1)
         missed = float(missed_shares(inside, masks[own], matrices[own], config.half_extent))
         if is_open and missed > MAX_MISSED and rejections < last:
             continue
@@ -56,23 +67,3 @@ def start_hull(
         f"{last}: the views contradict each other or their cameras are wrong; check that the "
         "object is centred at the origin with longest side 1 and that poses are OpenGL c2w"
     )
-
-
-def _inside(
-    masks: Tensor, matrices: Tensor, reference: int, rejections: int, half_extent: float
-) -> Tensor:
-    """Nodes that all masks but so many support, and the reference view's does."""
-
-    def votes(views: slice, rejected: int) -> Tensor:
-        return coverage_votes(
-            masks[views],
-            matrices[views],
-            nodes=HULL_NODES,
-            half_extent=half_extent,
-            rejections=rejected,
-        )
-
-    supported = votes(slice(None), rejections)
-    if rejections:
-        supported = torch.minimum(supported, votes(slice(reference, reference + 1), 0))
-    return supported >= INSIDE_COVERAGE
