@@ -25,8 +25,9 @@ from svim3d.io.orbit_repair import admit_views
 from svim3d.io.scene import read_object
 from svim3d.mesh.source_mesh import SourceMesh, normalised
 from svim3d.render.deferred import environment_shader
+from svim3d.render.outlines import sharpened, without_bleed
 from svim3d.render.pictures import render_pictures
-from svim3d.render.view_findings import SOFT_MASKS, view_findings
+from svim3d.render.view_findings import SOFT_MASKS, SOFT_PX, ramp_width_px, view_findings
 from svim3d.shading.octahedral import texel_directions
 from svim3d.shading.studio import studio_radiance
 
@@ -79,7 +80,27 @@ def _from_orbit(folder: Path, ctx: Context) -> MaterialViews:
     """Read, mend and check the views of an orbit folder."""
     cameras, images, reference = read_orbit(folder, notify=ctx.event)
     cameras, images, reference = admit_views(cameras, images, reference, ctx.event)
-    return MaterialViews(cameras=cameras, reference=reference, **images)
+    return MaterialViews(cameras=cameras, reference=reference, **_with_clean_outlines(images, ctx))
+
+
+def _with_clean_outlines(images: dict[str, Tensor], ctx: Context) -> dict[str, Tensor]:
+    """Outlines as sharp as a pixel, without the background that they were cut out of."""
+    width = ramp_width_px(images["mask"])
+    if width > SOFT_PX:
+        ctx.event(
+            SOFT_MASKS,
+            f"masks fade over about {width:.1f} pixels: they are sharpened about half coverage, "
+            "which the outline may miss by as much; give sharper masks",
+        )
+        images = sharpened(images, width)
+    images, bled = without_bleed(images)
+    if bled:
+        ctx.event(
+            "background_bleeds",
+            f"the background shines through along outlines (basecolor is off by {bled:.2f}): "
+            "half-covered pixels take those just inside; give views that were cut out cleanly",
+        )
+    return images
 
 
 def _from_mesh(mesh: SourceMesh, config: GenerationConfig, ctx: Context) -> MaterialViews:

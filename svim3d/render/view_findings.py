@@ -22,9 +22,12 @@ CUT_SHARE = 0.1  # of a side of the frame, covered by the object
 PLATEAU = 1e-3  # relative distance to the largest value, within which highlights are one value
 CLIPPED_SHARE = 0.01  # of the covered pixels, on that plateau
 GLARE = 300.0  # times what a twentieth of the object exceeds: sparkles of noise, or a bare lamp
-DARK, DARK_SHARE = 0.02, 0.5  # luminance of the basecolor, and share of the pixels below it
-MIRROR_ROUGHNESS, MIRROR_SHARE = 0.2, 0.25
-SOFT_PX = 3.5  # width of the ramp of coverage; a pixel's own box makes one or two
+# Luminance of the basecolor below which a dielectric shows more of its surroundings (F0 is 0.04,
+# more towards the rim) than of itself, and the share of the pixels that lie below it.
+DARK, DARK_SHARE = 0.06, 0.5
+# Brushed steel (0.35) already loses 9 dB under a light that is found at 32 x 32 texels.
+MIRROR_ROUGHNESS, MIRROR_SHARE = 0.4, 0.25
+SOFT_PX = 2.0  # width of the ramp of coverage; sound views stay below 1.1, thin rods among them
 FAINT = 0.03  # coverage nearer to 0 or 1 counts as none or whole
 GRAZING, GRAZING_SHARE = 0.35, 0.1  # best cosine of any view, and share of the pixels below it
 NORMAL_BINS = 12  # per side of the cube that normals are sorted into
@@ -50,7 +53,7 @@ def view_findings(cameras: Cameras, images: Images) -> list[Finding]:
     return [
         *_few(cameras),
         *_cut_off(covered),
-        *_soft(images["mask"], covered),
+        *_soft(images["mask"]),
         *_clipped(images, covered),
         *_glaring(images, covered),
         *_dark(images, covered),
@@ -89,17 +92,22 @@ def _cut_off(covered: Bool[Tensor, "V H W"]) -> Iterator[Finding]:
         )
 
 
-def _soft(mask: Float[Tensor, "V H W 1"], covered: Bool[Tensor, "V H W"]) -> Iterator[Finding]:
-    partial = (mask > FAINT) & (mask < 1.0 - FAINT)
-    inside = torch.nn.functional.max_pool2d((~covered).float()[:, None], 3, 1, 1)[:, 0] > 0.0
-    rim = int((covered & inside).sum())
-    width = int(partial.sum()) / max(rim, 1)
+def _soft(mask: Float[Tensor, "V H W 1"]) -> Iterator[Finding]:
+    width = ramp_width_px(mask)
     if width > SOFT_PX:
         yield (
             SOFT_MASKS,
             f"masks fade over about {width:.1f} pixels: the outline is uncertain by as much, and "
             "colours along it may hold background; give sharper masks",
         )
+
+
+def ramp_width_px(mask: Float[Tensor, "V H W 1"]) -> float:
+    """Mean width over which coverage fades across outlines."""
+    covered = mask[..., 0] > COVERED
+    partial = (mask > FAINT) & (mask < 1.0 - FAINT)
+    inside = torch.nn.functional.max_pool2d((~covered).float()[:, None], 3, 1, 1)[:, 0] > 0.0
+    return int(partial.sum()) / max(int((covered & inside).sum()), 1)
 
 
 def _clipped(images: Images, covered: Bool[Tensor, "V H W"]) -> Iterator[Finding]:

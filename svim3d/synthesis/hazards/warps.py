@@ -169,7 +169,7 @@ HAZARDS = (
         "pixels",
         (0.0, 1.0, 2.0, 4.0),
         soft_masks,
-        notes=(DISAGREE, "soft_masks"),
+        notes=(DISAGREE, "soft_masks", "background_bleeds"),
         is_perturbation=True,
     ),
 )
