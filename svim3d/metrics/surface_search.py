@@ -1,8 +1,6 @@
-"""Figures of merit of pictures and surfaces.
+"""Points on a surface, and exact distances from points to triangles.
 
-Pictures: PSNR and mean angle inside a mask, structural similarity. Surfaces: exact distances from
-points to triangles (no sampling floor on the side measured against) and the overlap of enclosed
-volumes.
+There is no sampling floor on the side that is measured against.
 """
 
 import math
@@ -11,88 +9,17 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 
 from svim3d.compiled import kernel
-from svim3d.numerics import dot, normalize
 
 LEAF_FACES = 4  # triangles per leaf of the search tree
 MORTON_BITS = 20  # per axis; three axes fit a 63-bit key
 MAX_TREE_DEPTH = 64  # entries of the search stack: twice the depth of a tree over 2^30 leaves
-# Sample points stand off the cell centres by this share of a cell, so that columns never run
-# along edges and faces of meshes that were cut from the same lattice.
-OFF_LATTICE = math.pi * 1e-4
-
-# Source: Wang et al. 2004, "Image Quality Assessment", section III.C.
-SSIM_RADIUS_PX, SSIM_SPREAD_PX = 5, 1.5
-SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 Vector = tuple[float, float, float]
-
-
-def psnr(
-    image: Float[Tensor, "*batch C"],
-    truth: Float[Tensor, "*batch C"],
-    mask: Bool[Tensor, "*batch 1"],
-) -> float:
-    """Peak signal-to-noise ratio in dB inside a mask; both images are encoded for display, peak 1.
-
-    Equal images give infinity. The mean runs over masked pixels only: over a whole picture with
-    an equal background the figure would be higher by 10 log10(1 / share of the mask).
-    """
-    squared = (image - truth).square()[mask.expand_as(image)]
-    return float(-10.0 * squared.double().mean().log10())
-
-
-def mean_angle_deg(
-    a: Float[Tensor, "*batch 3"], b: Float[Tensor, "*batch 3"], mask: Bool[Tensor, "*batch 1"]
-) -> float:
-    """Mean angle between two direction fields inside a mask; need not be unit.
-
-    A zero vector (a pixel that one side does not cover) counts as 90 degrees.
-    """
-    a, b = normalize(a.double()), normalize(b.double())
-    # atan2 keeps small angles exact where acos loses half of the digits.
-    angle = torch.atan2(
-        torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=-1), dot(a, b)[..., 0]
-    )
-    blank = (a.square().sum(-1) < 0.5) | (b.square().sum(-1) < 0.5)
-    angle = torch.where(blank, math.pi / 2, angle)
-    return math.degrees(float(angle[mask[..., 0]].mean()))
-
-
-def structural_similarity(
-    image: Float[Tensor, "V H W C"], truth: Float[Tensor, "V H W C"]
-) -> Float[Tensor, "V H W 1"]:
-    """SSIM at every pixel, averaged over channels; display-encoded pictures, peak 1.
-
-    The Gaussian window has 11 pixels; beyond the border a picture goes on as its last row.
-
-    Source: Wang et al. 2004, eq. 13.
-    """
-    mean_a, mean_b = _gaussian_mean(image), _gaussian_mean(truth)
-    variance_a = _gaussian_mean(image.square()) - mean_a.square()
-    variance_b = _gaussian_mean(truth.square()) - mean_b.square()
-    covariance = _gaussian_mean(image * truth) - mean_a * mean_b
-    level = (2 * mean_a * mean_b + SSIM_C1) / (mean_a.square() + mean_b.square() + SSIM_C1)
-    structure = (2 * covariance + SSIM_C2) / (variance_a + variance_b + SSIM_C2)
-    return (level * structure).mean(-1, keepdim=True)
-
-
-def _gaussian_mean(pictures: Float[Tensor, "V H W C"]) -> Float[Tensor, "V H W C"]:
-    """Mean over SSIM's window, one axis after the other."""
-    offset = torch.arange(-SSIM_RADIUS_PX, SSIM_RADIUS_PX + 1).to(pictures)
-    window = (-0.5 * (offset / SSIM_SPREAD_PX) ** 2).exp()
-    window = window / window.sum()
-    planes = pictures.movedim(-1, 1).flatten(0, 1)[:, None]
-    padded = functional.pad(planes, [SSIM_RADIUS_PX] * 4, mode="replicate")
-    rows = functional.conv2d(padded, window.view(1, 1, -1, 1))
-    mean = functional.conv2d(rows, window.view(1, 1, 1, -1))
-    views, channels = len(pictures), pictures.shape[-1]
-    return mean.view(views, channels, *mean.shape[2:]).movedim(1, -1)
 
 
 def sample_surface(
@@ -250,68 +177,3 @@ def _nearest_squared(
                 stack[top], stack[top + 1] = far, near
                 top += 2
         squared[i] = best
-
-
-def occupancy(
-    vertices: Float[Tensor, "N 3"],
-    faces: Int[Tensor, "F 3"],
-    *,
-    resolution: int,
-    half_extent: float,
-) -> Bool[Tensor, "n n n"]:
-    """Which cells of a grid over [-half_extent, half_extent]^3 have their centre inside a mesh.
-
-    Inside is where the winding number, averaged over the six axis directions, exceeds one half.
-    For closed meshes all six agree; parts may overlap; small holes and open rims are voted down.
-    """
-    corners = vertices.detach().cpu().double()[faces.cpu().long()].numpy()
-    cell = 2.0 * half_extent / resolution
-    # In units of cells, with the centre of cell 0 at 0.
-    scaled = (corners + half_extent) / cell - 0.5 + OFF_LATTICE
-    total = np.zeros((resolution,) * 3)
-    for axis in range(3):
-        # A cyclic shift keeps the handedness, and so the sign of the crossings.
-        turned = np.ascontiguousarray(np.roll(scaled, -axis - 1, axis=2))
-        crossings = np.zeros((resolution, resolution, resolution + 1), np.int32)
-        _count_crossings(turned, crossings)
-        before = np.cumsum(crossings, axis=2)[..., :-1]
-        # Seen from below minus from above: the two ends of a ray through a closed mesh agree.
-        winding = before - 0.5 * crossings.sum(2, keepdims=True)
-        total += np.transpose(winding, np.roll((0, 1, 2), axis + 1))
-    return torch.from_numpy(total / 3.0 > 0.5)
-
-
-@kernel(fastmath=False)
-def _count_crossings(corners: NDArray[np.float64], crossings: NDArray[np.int32]) -> None:
-    """Count signed crossings of every column (x, y) below each cell; +1 enters along +z."""
-    size = crossings.shape[0]
-    for face in range(corners.shape[0]):
-        ax, ay, az = corners[face, 0]
-        bx, by, bz = corners[face, 1]
-        cx, cy, cz = corners[face, 2]
-        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-        if area == 0.0:
-            continue
-        x_first, x_last = (
-            max(0, math.ceil(min(ax, bx, cx))),
-            min(size - 1, math.floor(max(ax, bx, cx))),
-        )
-        y_first, y_last = (
-            max(0, math.ceil(min(ay, by, cy))),
-            min(size - 1, math.floor(max(ay, by, cy))),
-        )
-        for x in range(x_first, x_last + 1):
-            for y in range(y_first, y_last + 1):
-                u = ((bx - x) * (cy - y) - (cx - x) * (by - y)) / area
-                v = ((cx - x) * (ay - y) - (ax - x) * (cy - y)) / area
-                if u >= 0.0 and v >= 0.0 and u + v <= 1.0:
-                    z = u * az + v * bz + (1.0 - u - v) * cz
-                    cell = min(max(math.ceil(z), 0), size)
-                    # A face whose normal points down is where a column enters.
-                    crossings[x, y, cell] += 1 if area < 0.0 else -1
-
-
-def volume_iou(a: Bool[Tensor, "n n n"], b: Bool[Tensor, "n n n"]) -> float:
-    """Intersection over union of two occupancy grids; 1 if both are empty."""
-    union = int((a | b).sum())
-    return int((a & b).sum()) / union if union else 1.0
