@@ -29,6 +29,16 @@ def sample_surface(
     generator: torch.Generator,
 ) -> Float[Tensor, "count 3"]:
     """Points spread uniformly by area over a mesh."""
+    return sample_faces(vertices, faces, count, generator)[0]
+
+
+def sample_faces(
+    vertices: Float[Tensor, "N 3"],
+    faces: Int[Tensor, "F 3"],
+    count: int,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "count 3"], Int[Tensor, "count"]]:
+    """As `sample_surface`, and the face that each point lies on."""
     corners = vertices.double()[faces.long()]
     edge_a, edge_b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = torch.linalg.vector_norm(torch.linalg.cross(edge_a, edge_b), dim=-1)
@@ -36,19 +46,27 @@ def sample_surface(
     u, v = torch.rand(2, count, 1, generator=generator, dtype=torch.float64)
     # Points of the parallelogram's far half are folded back into the triangle.
     u, v = torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)
-    return (corners[face, 0] + u * edge_a[face] + v * edge_b[face]).to(vertices.dtype)
+    return (corners[face, 0] + u * edge_a[face] + v * edge_b[face]).to(vertices.dtype), face
 
 
 def distance_to_surface(
     points: Float[Tensor, "P 3"], vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]
 ) -> Float[Tensor, "P"]:
     """Exact distance from each point to its nearest triangle."""
+    return nearest_face(points, vertices, faces)[0]
+
+
+def nearest_face(
+    points: Float[Tensor, "P 3"], vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]
+) -> tuple[Float[Tensor, "P"], Int[Tensor, "P"]]:
+    """As `distance_to_surface`, and which triangle that is; of several one."""
     corners = vertices.detach().cpu().double()[faces.cpu().long()].numpy()
     tree = _SearchTree.build(corners)
     queries = np.ascontiguousarray(points.detach().cpu().double().numpy())
-    squared = np.empty(len(queries))
-    _nearest_squared(queries, tree.corners, tree.low, tree.high, tree.first_leaf, squared)
-    return torch.from_numpy(np.sqrt(squared)).to(points)
+    squared, nearest = np.empty(len(queries)), np.empty(len(queries), np.int64)
+    _search(queries, tree.corners, tree.low, tree.high, tree.first_leaf, squared, nearest)
+    distance = torch.from_numpy(np.sqrt(squared)).to(points)
+    return distance, torch.from_numpy(tree.faces[nearest]).to(points.device)
 
 
 @dataclass(frozen=True)
@@ -56,10 +74,12 @@ class _SearchTree:
     """A complete binary tree of boxes over triangles in Morton order.
 
     Node i has children 2i + 1 and 2i + 2; leaf j = node first_leaf + j holds the triangles
-    [LEAF_FACES * j, LEAF_FACES * (j + 1)). The last triangle is repeated to fill the tree.
+    [LEAF_FACES * j, LEAF_FACES * (j + 1)). The last triangle is repeated to fill the tree; `faces`
+    says which one of the mesh each is.
     """
 
     corners: NDArray[np.float64]
+    faces: NDArray[np.int64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     first_leaf: int
@@ -68,13 +88,14 @@ class _SearchTree:
     def build(cls, corners: NDArray[np.float64]) -> "_SearchTree":
         order = np.argsort(_morton_keys(corners.mean(1)), kind="stable")
         leaves = 1 << max(0, math.ceil(math.log2(max(1, len(corners) / LEAF_FACES))))
-        padded = corners[np.pad(order, (0, leaves * LEAF_FACES - len(order)), mode="edge")]
+        filled = np.pad(order, (0, leaves * LEAF_FACES - len(order)), mode="edge")
+        padded = corners[filled]
         blocks = padded.reshape(leaves, LEAF_FACES * 3, 3)
         low, high = [blocks.min(1)], [blocks.max(1)]
         while len(low[0]) > 1:
             low.insert(0, np.minimum(low[0][0::2], low[0][1::2]))
             high.insert(0, np.maximum(high[0][0::2], high[0][1::2]))
-        return cls(padded, np.concatenate(low), np.concatenate(high), leaves - 1)
+        return cls(padded, filled, np.concatenate(low), np.concatenate(high), leaves - 1)
 
 
 def _morton_keys(points: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -147,18 +168,19 @@ def _triangle_squared(p: NDArray[np.float64], corners: NDArray[np.float64]) -> f
 
 
 @kernel(parallel=True, fastmath=False)
-def _nearest_squared(
+def _search(
     points: NDArray[np.float64],
     corners: NDArray[np.float64],
     low: NDArray[np.float64],
     high: NDArray[np.float64],
     first_leaf: int,
     squared: NDArray[np.float64],
+    nearest: NDArray[np.int64],
 ) -> None:
     """Depth-first search of the box tree, nearer child first."""
     for i in numba.prange(len(points)):
         stack = np.empty(MAX_TREE_DEPTH, np.int64)
-        stack[0], top, best = 0, 1, np.inf
+        stack[0], top, best, found = 0, 1, np.inf, 0
         while top > 0:
             top -= 1
             node = stack[top]
@@ -167,7 +189,9 @@ def _nearest_squared(
             if node >= first_leaf:
                 start = (node - first_leaf) * LEAF_FACES
                 for face in range(start, start + LEAF_FACES):
-                    best = min(best, _triangle_squared(points[i], corners[face]))
+                    here = _triangle_squared(points[i], corners[face])
+                    if here < best:
+                        best, found = here, face
             else:
                 near, far = 2 * node + 1, 2 * node + 2
                 if _box_squared(points[i], low[far], high[far]) < _box_squared(
@@ -176,4 +200,4 @@ def _nearest_squared(
                     near, far = far, near
                 stack[top], stack[top + 1] = far, near
                 top += 2
-        squared[i] = best
+        squared[i], nearest[i] = best, found
