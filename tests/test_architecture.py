@@ -114,6 +114,8 @@ DOORS = {
     "OpenEXR": ("svim3d.io.exr",),
     "safetensors": ("svim3d.io.weights",),
     "PIL": ("svim3d.io.image", "svim3d.io.photo", "svim3d.io.photo_header", "svim3d.io.thumbnail"),
+    "pxr": ("svim3d.io.usd",),
+    "DracoPy": ("svim3d.io.draco",),
     "onnxruntime": ("svim3d.io.matting_network",),
     "imageio_ffmpeg": ("svim3d.io.animation",),
     # A script for an interpreter of its own: nothing imports it.
