@@ -20,11 +20,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from svim3d.color import linear_from_srgb
-from svim3d.io.image import decode_image, encode_png
+from svim3d.io.image import decode_image
+from svim3d.io.texture_files import FOLDER, full_orm, texture_files
 from svim3d.mesh.painted_mesh import PaintedMesh
 
 MISSING = "USD files need usd-core, which is not installed; pip install 'svim3d[usd]'"
-FOLDER = "textures"
 METERS_PER_UNIT = 1.0  # as glTF has it: the longest side of an asset is one metre
 ORM_CHANNELS = (("occlusion", "r"), ("roughness", "g"), ("metallic", "b"))
 ZIP_ALIGNMENT = 64  # bytes: the files of a package are mapped into memory as they lie
@@ -47,11 +47,10 @@ def usd_files(mesh: PaintedMesh, *, name: str = "asset") -> dict[str, bytes]:
     Raises:
         ValueError: usd-core is not installed.
     """
-    pictures = _pictures(mesh)
     with tempfile.TemporaryDirectory(prefix="svim3d_usd_") as folder:  # USD writes files only
         file = Path(folder) / f"{name}.usdc"
-        _write_stage(file, mesh, pictures, name)
-        return {file.name: file.read_bytes()} | pictures
+        _write_stage(file, mesh, name)
+        return {file.name: file.read_bytes()} | _pictures(mesh)
 
 
 def usdz_bytes(mesh: PaintedMesh, *, name: str = "asset") -> bytes:
@@ -73,29 +72,25 @@ def usdz_bytes(mesh: PaintedMesh, *, name: str = "asset") -> bytes:
 
 
 def _pictures(mesh: PaintedMesh) -> dict[str, bytes]:
-    """PNG files by their path from the stage."""
-    files = {}
-    if mesh.basecolor.ndim == TEXTURE:
-        files[f"{FOLDER}/basecolor.png"] = encode_png(mesh.basecolor, srgb=True)
-    if any(plane.ndim for plane in _orm(mesh).values()):
-        factor = torch.ones(3) if mesh.orm_factor is None else mesh.orm_factor
-        files[f"{FOLDER}/orm.png"] = encode_png(mesh.orm * factor)
-    if mesh.normal_tangent is not None:
-        files[f"{FOLDER}/normal.png"] = encode_png(mesh.normal_tangent * 0.5 + 0.5)
-    return files
+    """Those of the asset's pictures that the material reads."""
+    read = {"basecolor": mesh.basecolor.ndim == TEXTURE, "normal": True}
+    read["orm"] = any(plane.ndim for plane in _orm(mesh).values())
+    return {
+        file: content
+        for file, content in texture_files(mesh).items()
+        if read.get(Path(file).stem, False)
+    }
 
 
 def _orm(mesh: PaintedMesh) -> dict[str, Tensor]:
     """Occlusion, roughness and metallic: a texture where it varies, else its one value."""
-    factor = torch.ones(3) if mesh.orm_factor is None else mesh.orm_factor
-    planes = (mesh.orm * factor).unbind(-1)
     return {
         name: plane if plane.ndim == 2 and bool((plane != plane[0, 0]).any()) else plane.mean()
-        for (name, _), plane in zip(ORM_CHANNELS, planes, strict=True)
+        for (name, _), plane in zip(ORM_CHANNELS, full_orm(mesh).unbind(-1), strict=True)
     }
 
 
-def _write_stage(file: Path, mesh: PaintedMesh, pictures: dict[str, bytes], name: str) -> None:
+def _write_stage(file: Path, mesh: PaintedMesh, name: str) -> None:
     """The stage: a component with one mesh and one material."""
     try:
         from pxr import Kind, Sdf, Usd, UsdGeom, UsdShade
@@ -111,7 +106,7 @@ def _write_stage(file: Path, mesh: PaintedMesh, pictures: dict[str, bytes], name
     _fill_mesh(shape, mesh)
     UsdGeom.Scope.Define(stage, f"/{name}/materials")
     material = UsdShade.Material.Define(stage, f"/{name}/materials/surface")
-    _Surface(stage, material, Sdf, UsdShade).connect(mesh, pictures)
+    _Surface(stage, material, Sdf, UsdShade).connect(mesh)
     UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
     stage.GetRootLayer().Save()
 
@@ -152,7 +147,7 @@ class _Surface:
     sdf: Any
     shade: Any
 
-    def connect(self, mesh: PaintedMesh, pictures: dict[str, bytes]) -> None:
+    def connect(self, mesh: PaintedMesh) -> None:
         """A UsdPreviewSurface with its inputs set or connected to pictures."""
         types = self.sdf.ValueTypeNames
         surface = self._shader("preview", "UsdPreviewSurface")
