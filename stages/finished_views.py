@@ -42,7 +42,7 @@ class ViewFolder:
 
     def confidence(self) -> Float[Tensor, "V H W 1"] | None:
         """How far each pixel was trusted, where that is known."""
-        _, images, _ = read_orbit(self.folder, wanted=())
+        _, images, _ = read_orbit(self.folder, wanted=("mask",))
         return images.get("confidence")
 
 

@@ -246,7 +246,8 @@ def reopen_usdz(content: bytes) -> ReopenedUsd:
             for name in ("diffuseColor", "occlusion", "roughness", "metallic", "normal")
         }
         colours = shape.GetDisplayColorAttr().Get()
-        st = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st").Get()
+        variables = UsdGeom.PrimvarsAPI(prim)
+        st = variables.GetPrimvar("st").Get() if variables.HasPrimvar("st") else None
         points = np.asarray(shape.GetPointsAttr().Get(), np.float64) @ world[:3, :3] + world[3, :3]
         basecolor = planes["diffuseColor"]
         normal = planes["normal"]
