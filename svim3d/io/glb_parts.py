@@ -105,14 +105,19 @@ class GlbParts:
         """A vertex attribute; `bounds` adds the extent that glTF wants of positions."""
         return self.attribute(values.detach().cpu().float().numpy().astype("<f4"), bounds=bounds)
 
-    def attribute(self, values: NDArray[Any], *, bounds: bool = False) -> int:
-        """A vertex attribute of any component type; integers stand for [-1, 1] or [0, 1]."""
+    def attribute(
+        self, values: NDArray[Any], *, bounds: bool = False, normalized: bool = True
+    ) -> int:
+        """A vertex attribute of any type; `normalized` integers stand for [-1, 1] or [0, 1]."""
         kind = values.dtype.str[1:]
         padding = -values.shape[1] * values.itemsize % ALIGNMENT // values.itemsize
         padded = np.pad(values, ((0, 0), (0, padding)))
         stride = {"byteStride": padded.shape[1] * values.itemsize} if padding else {}
         view = self.view(padded.tobytes(), VERTEX_BUFFER, **stride)
-        return self.append("accessors", {"bufferView": view} | accessor(values, kind, bounds))
+        return self.append(
+            "accessors",
+            {"bufferView": view} | accessor(values, kind, bounds, normalized=normalized),
+        )
 
     def indices(self, faces: Tensor, vertices: int) -> int:
         """Triangle indices in the smallest type that holds them."""
@@ -148,14 +153,14 @@ class GlbParts:
         return pack_glb(full, binary)
 
 
-def accessor(values: NDArray[Any], kind: str, bounds: bool) -> Json:
+def accessor(values: NDArray[Any], kind: str, bounds: bool, *, normalized: bool = True) -> Json:
     """What is said of vertex values: their type, number and, on demand, extent."""
     entry: Json = {
         "componentType": COMPONENTS[kind],
         "count": len(values),
         "type": f"VEC{values.shape[1]}",
     }
-    if kind != "f4":
+    if kind != "f4" and normalized:
         entry["normalized"] = True
     if bounds:
         entry |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}

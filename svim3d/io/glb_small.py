@@ -1,9 +1,9 @@
 """The asset as a smaller GLB: quantised or compressed triangles, JPEG where PNG is longer.
 
-Vertices are 16-bit in a cube around the object, which the node's scale undoes. Tangents are left
-out where Draco compresses: a loader makes the same ones, since they are MikkTSpace. Pictures are
-JPEG of full colour resolution, which glTF knows without an extension. What each costs is in
-docs/exports.md.
+Vertices are whole numbers of 16 bits in a cube around the object, which the node's scale undoes;
+all else stands for [0, 1] or [-1, 1]. Tangents are left out where Draco compresses: a loader makes
+the same ones, since they are MikkTSpace. Pictures are JPEG of full colour resolution, which glTF
+knows without an extension. What each costs is in docs/exports.md.
 
 Source: Khronos KHR_mesh_quantization and KHR_draco_mesh_compression.
 """
@@ -79,14 +79,14 @@ class _Frame:
 
     def node(self) -> Json:
         """What the node has to undo."""
-        return {"translation": self.centre.tolist(), "scale": [self.half] * 3}
+        return {"translation": self.centre.tolist(), "scale": [self.half / np.iinfo("i2").max] * 3}
 
 
 def _quantised(parts: GlbParts, mesh: PaintedMesh, frame: _Frame) -> Json:
     """Attributes of 16 bits, tangents of 8: they turn a normal map, no outline."""
     positions = (_floats(mesh.vertices) - frame.centre) / frame.half
     attributes = {
-        "POSITION": parts.attribute(_integers(positions, "i2"), bounds=True),
+        "POSITION": parts.attribute(_integers(positions, "i2"), bounds=True, normalized=False),
         "NORMAL": parts.attribute(_integers(_floats(mesh.normals), "i2")),
     }
     if mesh.tangents is not None:
