@@ -10,7 +10,6 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
-from pathlib import Path
 
 from flows.batch_options import batch_options
 from flows.data_options import data_options
@@ -24,19 +23,25 @@ from flows.operator_options import (
     status_options,
     store_options,
 )
-from flows.options import edit_options, job_options, relight_options
+from flows.options import (
+    edit_options,
+    export_options,
+    job_options,
+    relight_options,
+    shared_options,
+)
 from flows.serve_options import serve_options
 from flows.stability_options import stability_options
 from flows.train_options import train_options
 
 DONE, FAILED, BAD_INPUT, CANCELLED = 0, 1, 2, 130
-DEFAULT_STORE = Path(".svim3d")
 
 # Commands whose options go to the function of the same name in a module of their own.
 DOERS = {
     "batch": "flows.batch",
     "relight": "flows.relight",
     "edit": "flows.edit",
+    "export": "flows.export",
     "train": "flows.train",
     "data": "flows.data",
     "model": "flows.model",
@@ -105,16 +110,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="svim3d", description="A photo or views of an object in, a relightable 3D asset out."
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
-    shared = argparse.ArgumentParser(add_help=False)
-    shared.add_argument("--debug", action="store_true", help="show whole tracebacks")
-    shared.add_argument(
-        "--store",
-        type=Path,
-        default=DEFAULT_STORE,
-        metavar="DIR",
-        help="where artifacts are kept (%(default)s)",
-    )
-    job, hooks = job_options(), hook_options()
+    job, hooks, shared = job_options(), hook_options(), shared_options()
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     for name, parents, purpose in (
         ("run", [job, hooks, shared], "make the asset; finished stages are taken from the store"),
@@ -125,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
             "show views or an asset under another light",
         ),
         ("edit", [edit_options(), shared], "write an asset with other materials"),
+        ("export", [export_options(), shared], "write a finished run's asset in other formats"),
         ("train", [train_options(), shared], "train a generator on rendered examples"),
         ("data", [data_options(), shared], "render training data for the generator"),
         ("model", [model_options(shared)], "convert a checkpoint, or tell what a model holds"),

@@ -4,8 +4,10 @@ import argparse
 import json
 from pathlib import Path
 
+from flows.operator_options import RUN_HELP
 from flows.pipeline import IMAGE_TO_ASSET
 
+DEFAULT_STORE = Path(".svim3d")
 STAGES = ", ".join(IMAGE_TO_ASSET.names)
 
 
@@ -42,6 +44,20 @@ def job_options() -> argparse.ArgumentParser:
     add_share(job)
     add_machine(job)
     return job
+
+
+def shared_options() -> argparse.ArgumentParser:
+    """Options that all commands have."""
+    shared = argparse.ArgumentParser(add_help=False)
+    shared.add_argument("--debug", action="store_true", help="show whole tracebacks")
+    shared.add_argument(
+        "--store",
+        type=Path,
+        default=DEFAULT_STORE,
+        metavar="DIR",
+        help="where artifacts are kept (%(default)s)",
+    )
+    return shared
 
 
 def add_share(parser: argparse.ArgumentParser) -> None:
@@ -137,6 +153,34 @@ def relight_options() -> argparse.ArgumentParser:
     _add_rendering(options)
     add_machine(options)
     options.add_argument("--force", action="store_true", help="compute again though it is there")
+    return options
+
+
+def export_options() -> argparse.ArgumentParser:
+    """Options of `export`."""
+    options = argparse.ArgumentParser(add_help=False)
+    options.add_argument("run", metavar="RUN", help=RUN_HELP)
+    options.add_argument(
+        "--formats",
+        metavar="NAMES",
+        help="of obj, usdc, usdz, textures and aov, with commas between; glb is always written",
+    )
+    options.add_argument("--lods", type=int, metavar="N", help="coarser levels of detail, up to 3")
+    options.add_argument(
+        "--compression",
+        choices=("none", "quantised", "draco"),
+        help="of a second, smaller asset_small.glb",
+    )
+    options.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="OUT",
+        help="folder (the run's, which is laid out anew)",
+    )
+    options.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="(%(default)s)"
+    )
     return options
 
 

@@ -107,6 +107,13 @@ class Pipeline:
             )
 
 
+# What the export stage writes on request.
+EXPORTED = (
+    *("asset_lod1.glb", "asset_lod2.glb", "asset_lod3.glb", "asset_small.glb"),
+    *("asset.usdz", "asset.usdc", "textures", "aov", "asset.obj", "asset.mtl"),
+    *(f"asset_{channel}.png" for channel in ("basecolor", "roughness", "metallic", "normal")),
+)
+
 IMAGE_TO_ASSET = Pipeline(
     name="image-to-asset",
     nodes=(
@@ -117,7 +124,7 @@ IMAGE_TO_ASSET = Pipeline(
         Node("nerf", ("generation", "env_preopt", "capacity")),
         Node("dmtet", ("generation", "nerf", "capacity"), is_skippable=True),
         Node("uv_bake", ("generation", "nerf", "dmtet", "capacity"), is_skippable=True),
-        Node("export", ("nerf", "dmtet", "uv_bake")),
+        Node("export", ("nerf", "dmtet", "uv_bake", "generation")),
         Node("preview", ("generation", "nerf", "export"), is_skippable=True),
     ),
     products=(
@@ -127,6 +134,7 @@ IMAGE_TO_ASSET = Pipeline(
         ),
         Product("preview.png", (("preview", "preview.png"),)),
         Product("views.png", (("generation", "views.png"),)),
+        *(Product(name, (("export", name),)) for name in EXPORTED),
     ),
     takes=(*PHOTOS, *MESHES),
 )

@@ -49,7 +49,7 @@ def write_run_folder(
             _link(out / node.name, store.artifact(stored.key) if stored else None)
         for product in plan.pipeline.products:
             _copy_product(out, product, artifacts)
-        page = json.dumps(_page(plan, artifacts, about), indent=1)
+        page = json.dumps(_page(plan, artifacts, about) | {"products": _sizes(out, plan)}, indent=1)
         replace_file(out / RUN_PAGE, page.encode())
     except OSError as error:
         raise InputError(f"the run folder {out} cannot be written: {error}") from error
@@ -99,6 +99,16 @@ def _copy_product(out: Path, product: Product, artifacts: Mapping[str, Stored]) 
         shutil.rmtree(target)
     target.unlink(missing_ok=True)
     return None
+
+
+def _sizes(out: Path, plan: Plan) -> dict[str, int]:
+    """Bytes of each product that is there; of a folder, of all its files."""
+    found = {product.name: out / product.name for product in plan.pipeline.products}
+    return {
+        name: sum(f.stat().st_size for f in (path.rglob("*") if path.is_dir() else [path]))
+        for name, path in found.items()
+        if path.exists()
+    }
 
 
 def replace_file(file: Path, content: bytes) -> None:

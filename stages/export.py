@@ -1,14 +1,13 @@
-"""Textured mesh to finished files: GLB, on request OBJ, and the environment that belongs to it.
+"""Textured mesh to finished files: GLB, other formats on request, and the environment with it.
 
 Reads the textured mesh or, when phase 3 was skipped, colours the surface per vertex; writes
-`asset.glb` and `environment.exr`, on request coarser levels of detail. Each GLB is opened again by
-another reader (trimesh) and compared.
+`asset.glb` and `environment.exr`. On request: coarser levels of detail, a smaller GLB, OBJ, USDC,
+USDZ, the textures alone, and the asset as layers in the cameras of the views. Each GLB is opened
+again by another reader (trimesh) and compared.
 """
 
 from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,12 +15,13 @@ from torch import Tensor
 from stages.artifacts import ExportedAsset, FittedField, RefinedSurface, TexturedMesh
 from stages.base import Context, Stage
 from stages.errors import InputError
+from stages.export_checks import check_glb
+from stages.export_formats import NAME, other_files, writers_parts
+from stages.finished_views import ViewFolder, finished_views
 from stages.settings.export import ExportConfig
 from svim3d.cameras import fitting_radius, orbit_angles, orbit_cameras
-from svim3d.color import srgb_from_linear
 from svim3d.io.exr import write_rgb
-from svim3d.io.glb import glb_bytes, reopen_glb
-from svim3d.io.obj import obj_files
+from svim3d.io.glb import glb_bytes
 from svim3d.mesh.cleanup import CleanMesh, clean_surface, decimate, is_closed
 from svim3d.mesh.mesh import signed_volume, vertex_normals
 from svim3d.mesh.texels import rasterize_uv
@@ -31,21 +31,19 @@ from svim3d.render.material_evidence import LARGEST_PALETTE
 from svim3d.render.texture_transfer import transferred
 from svim3d.shading.environment import latlong_from_octahedral
 
-NAME = "asset"
 ENVIRONMENT_HEIGHT = 128  # rows of the lat-long picture; an octahedral map of 128^2 holds no more
 MIN_AREA_SHARE, MIN_EXTENT_SHARE = 0.002, 0.05  # of floaters, the defaults of uv_bake
 POINTS_PER_CHUNK = 2**17  # bounds the memory of the field's intermediate values
-POSITION_TOLERANCE = 1e-6  # world units; the file holds the same 32-bit floats
 # Cameras that levels of detail are held against: the views that the asset came of are not at hand.
 LOD_VIEWS, LOD_SWING_DEG, LOD_PICTURE_PX = 8, 30.0, 256
 FOV_Y_DEG, FILL = 33.8, 0.85
-TEXTURE_TOLERANCE = 1.01 / 255.0  # one step of 8 bits and its rounding
 
 
 def run(
     field: FittedField,
     surface: RefinedSurface | None,
     textured: TexturedMesh | None,
+    views: ViewFolder,
     *,
     config: ExportConfig,
     ctx: Context,
@@ -54,7 +52,7 @@ def run(
 
     Raises:
         InputError: there is no mesh to write.
-        RuntimeError: the written GLB does not read back as what was written.
+        RuntimeError: a written file does not read back as what was written.
     """
     mesh = textured
     if mesh is None:
@@ -74,25 +72,18 @@ def run(
             f"{error.normal_deg:.1f} deg off asset.glb",
             tell=False,
         )
-    if "obj" in config.formats:
-        parts = _parts(mesh)
-        del parts["tangents"]
-        files |= obj_files(**parts)
+    files |= other_files(mesh, config, ctx)
     light = surface.environment if surface is not None else field.environment
+    if "aov" in config.formats:
+        files |= finished_views(files[f"{NAME}.glb"], views, light, ctx)
     files["environment.exr"] = _environment_exr(light, ctx.work)
     return ExportedAsset(files, summary)
 
 
-def _parts(mesh: TexturedMesh) -> dict[str, Any]:
-    """What the writers ask for."""
-    return {field.name: getattr(mesh, field.name) for field in fields(mesh)} | {"name": NAME}
-
-
 def _glb(mesh: TexturedMesh) -> bytes:
     """The mesh as a file, checked."""
-    parts = _parts(mesh)
-    content = glb_bytes(**parts)
-    _check(content, mesh)
+    content = glb_bytes(**writers_parts(mesh))
+    check_glb(content, mesh)
     return content
 
 
@@ -154,37 +145,6 @@ def _colored(fitted: RefinedSurface, config: ExportConfig, ctx: Context) -> Text
         orm=torch.cat(orms),
         normal_tangent=None,
     )
-
-
-def _check(content: bytes, mesh: TexturedMesh) -> None:
-    """Compare the reopened GLB with what went in."""
-    found = reopen_glb(content)
-    if found.vertices.shape != mesh.vertices.shape or found.faces.shape != mesh.faces.shape:
-        raise RuntimeError(
-            f"asset.glb reads back with {len(found.vertices)} vertices and {len(found.faces)} "
-            f"faces instead of {len(mesh.vertices)} and {len(mesh.faces)}"
-        )
-    factor = torch.ones(3) if mesh.orm_factor is None else mesh.orm_factor
-    is_picture = mesh.basecolor.ndim == 3
-    errors: dict[str, tuple[Tensor, Tensor | None, float]] = {
-        "positions": (mesh.vertices, found.vertices, POSITION_TOLERANCE),
-        "basecolor": (
-            srgb_from_linear(mesh.basecolor) if is_picture else mesh.basecolor,
-            srgb_from_linear(found.basecolor) if is_picture else found.basecolor,
-            TEXTURE_TOLERANCE,
-        ),
-    }
-    if mesh.uv is not None:
-        errors["uv"] = (mesh.uv, found.uv, POSITION_TOLERANCE)
-    if mesh.orm.ndim != 2:
-        errors["orm"] = (mesh.orm * factor, found.orm, TEXTURE_TOLERANCE)
-    if mesh.normal_tangent is not None:
-        # Decoded normals span [-1, 1], so a step is twice as large.
-        errors["normals"] = (mesh.normal_tangent, found.normal_tangent, 2 * TEXTURE_TOLERANCE)
-    for name, (wanted, got, tolerance) in errors.items():
-        error = torch.inf if got is None else float((wanted - got).abs().max())
-        if not error <= tolerance:
-            raise RuntimeError(f"asset.glb reads back with {name} off by {error:.3g}")
 
 
 def _environment_exr(radiance: Tensor, work: Path) -> bytes:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -16,7 +17,13 @@ BEAUTY = "beauty"  # the layer that viewers show first
 COLOUR_LAYERS = ("beauty", "combined", "rgba", "rgb")  # names that renderers give it, lower case
 
 
-def write_exr(file: Path, channels: Mapping[str, Plane], *, half: bool = True) -> None:
+def write_exr(
+    file: Path,
+    channels: Mapping[str, Plane],
+    *,
+    half: bool = True,
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
     """Write planes [H, W], all of one size, as a ZIP-compressed scanline EXR.
 
     Args:
@@ -24,8 +31,10 @@ def write_exr(file: Path, channels: Mapping[str, Plane], *, half: bool = True) -
         channels: name (`R`, `normal.X`, ...) -> plane.
         half: 16-bit float (max 65504; values above are clipped), else 32-bit. `depth.Z` is
             always 32-bit.
+        attributes: what the header says besides: texts, numbers, matrices.
     """
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header |= attributes or {}
     packed = {
         name: np.ascontiguousarray(
             np.clip(plane, -MAX_HALF, MAX_HALF) if half and name != "depth.Z" else plane,
@@ -52,6 +61,19 @@ def read_exr(file: Path) -> dict[str, Plane]:
                 name: np.asarray(channel.pixels, np.float32)
                 for name, channel in image.channels().items()
             }
+    except Exception as error:
+        raise ValueError(f"cannot read {file} as OpenEXR: {error}") from error
+
+
+def read_exr_attributes(file: Path) -> dict[str, Any]:
+    """What the header says: texts, numbers, matrices by name.
+
+    Raises:
+        ValueError: the file is missing, cut short within its header or no EXR.
+    """
+    try:
+        with OpenEXR.File(str(file), header_only=True) as image:
+            return dict(image.header())
     except Exception as error:
         raise ValueError(f"cannot read {file} as OpenEXR: {error}") from error
 

@@ -9,30 +9,27 @@ other libraries.
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 from torch import Tensor
 
 from svim3d.color import linear_from_srgb
-from svim3d.io.gltf import ALIGNMENT, pack_glb, read_gltf
+from svim3d.io.glb_parts import (
+    CONSTANT,
+    FACTORS,
+    PER_VERTEX,
+    GlbParts,
+    check_layout,
+    glb_material,
+)
+from svim3d.io.gltf import read_gltf
 from svim3d.io.image import encode_png, encode_small_png
 from svim3d.io.obj import read_obj
 from svim3d.mesh.source_mesh import SourceMesh
 from svim3d.numerics import normalize
-
-UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5123, 5125, 5126
-VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
-LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
-CONSTANT, PER_VERTEX, TEXTURE = 1, 2, 3  # dimensions of a material's values
-FACTORS = ("roughnessFactor", "metallicFactor")
-MAX_SHORT_VERTICES = 65535  # index 65535 itself restarts a primitive
-
-Json = dict[str, Any]
 
 
 def read_mesh(file: Path) -> SourceMesh:
@@ -87,8 +84,8 @@ def glb_bytes(
             pictures are stored as small as they go.
         name: of the node, mesh and material.
     """
-    _check_layout(basecolor, orm, uv, tangents, normal_tangent)
-    parts = _Parts()
+    check_layout(basecolor, orm, uv, tangents, normal_tangent)
+    parts = GlbParts()
     attributes = {
         "POSITION": parts.floats(vertices, bounds=True),
         "NORMAL": parts.floats(normalize(normals)),
@@ -101,7 +98,8 @@ def glb_bytes(
         attributes["COLOR_0"] = parts.floats(basecolor.clamp(0.0, 1.0))
     if uv is not None:
         attributes["TEXCOORD_0"] = parts.floats(uv)
-    material = {"name": name, **_material(parts, basecolor, orm, normal_tangent, orm_factor)}
+    encode = encode_png if orm_factor is None else encode_small_png
+    material = glb_material(parts, basecolor, orm, normal_tangent, orm_factor, encode)
     primitive = {
         "attributes": attributes,
         "indices": parts.indices(faces, len(vertices)),
@@ -113,60 +111,9 @@ def glb_bytes(
             "scenes": [{"nodes": [0]}],
             "nodes": [{"name": name, "mesh": 0}],
             "meshes": [{"name": name, "primitives": [primitive]}],
-            "materials": [material],
+            "materials": [{"name": name, **material}],
         }
     )
-
-
-def _check_layout(
-    basecolor: Tensor,
-    orm: Tensor,
-    uv: Tensor | None,
-    tangents: Tensor | None,
-    normal_tangent: Tensor | None,
-) -> None:
-    """Refuse what no glTF material can mean."""
-    if (normal_tangent is None) != (tangents is None) or (tangents is not None and uv is None):
-        raise ValueError("a normal map, tangents and uv go together: give all or neither")
-    is_textured = TEXTURE in (basecolor.ndim, orm.ndim) or normal_tangent is not None
-    if is_textured != (uv is not None):
-        raise ValueError("textures and uv go together: give both or neither")
-    if orm.ndim == CONSTANT and float(orm[0]) != 1.0:
-        raise ValueError("occlusion needs a texture: glTF has no factor for it")
-
-
-def _material(
-    parts: "_Parts",
-    basecolor: Tensor,
-    orm: Tensor,
-    normal_tangent: Tensor | None,
-    orm_factor: Tensor | None,
-) -> Json:
-    """Factors and textures of the material."""
-    encode = encode_png if orm_factor is None else encode_small_png
-    factor = torch.ones(3) if orm_factor is None else orm_factor
-    shading: Json = {}
-    material: Json = {"pbrMetallicRoughness": shading}
-    if basecolor.ndim == CONSTANT:
-        shading["baseColorFactor"] = [*basecolor.clamp(0.0, 1.0).tolist(), 1.0]
-    elif basecolor.ndim == TEXTURE:
-        shading["baseColorTexture"] = parts.texture("basecolor", encode(basecolor, srgb=True))
-    if orm.ndim == TEXTURE:
-        reflects = orm_factor is None or bool((orm[..., 1:] < 1.0).any())
-        occludes = bool((orm[..., 0] < 1.0).any())
-        texture = parts.texture("orm", encode(orm)) if reflects or occludes else {}
-        if reflects:
-            shading["metallicRoughnessTexture"] = texture
-        if occludes:
-            material["occlusionTexture"] = dict(texture)
-    else:
-        factor = factor * (orm if orm.ndim == CONSTANT else orm.mean(0))
-    for name, value in zip(FACTORS, factor[1:].clamp(0.0, 1.0).tolist(), strict=True):
-        if value != 1.0 or orm.ndim != TEXTURE:
-            shading[name] = value
-    if normal_tangent is not None:
-        material["normalTexture"] = parts.texture("normal", encode(normal_tangent * 0.5 + 0.5))
-    return material
 
 
 @dataclass(frozen=True)
@@ -230,73 +177,3 @@ def reopen_glb(content: bytes) -> ReopenedGlb:
         orm=orm,
         normal_tangent=None if normal is None else normal * 2.0 - 1.0,
     )
-
-
-class _Parts:
-    """Collects what the document refers to by index."""
-
-    def __init__(self) -> None:
-        self._content = bytearray()
-        self._lists: dict[str, list[Json]] = {
-            "accessors": [],
-            "bufferViews": [],
-            "images": [],
-            "textures": [],
-            "samplers": [],
-        }
-
-    def _append(self, kind: str, entry: Json) -> int:
-        self._lists[kind].append(entry)
-        return len(self._lists[kind]) - 1
-
-    def _view(self, content: bytes, target: int | None = None) -> int:
-        """Add aligned bytes to the buffer."""
-        self._content += b"\0" * (-len(self._content) % ALIGNMENT)
-        entry: Json = {"buffer": 0, "byteOffset": len(self._content), "byteLength": len(content)}
-        self._content += content
-        return self._append("bufferViews", entry | ({} if target is None else {"target": target}))
-
-    def floats(self, values: Tensor, *, bounds: bool = False) -> int:
-        """A vertex attribute; `bounds` adds the extent that glTF wants of positions."""
-        array: NDArray[np.float32] = values.detach().cpu().float().numpy()
-        entry: Json = {
-            "bufferView": self._view(array.astype("<f4").tobytes(), VERTEX_BUFFER),
-            "componentType": FLOAT,
-            "count": len(array),
-            "type": f"VEC{array.shape[1]}",
-        }
-        if bounds:
-            entry |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
-        return self._append("accessors", entry)
-
-    def indices(self, faces: Tensor, vertices: int) -> int:
-        """Triangle indices in the smallest type that holds them."""
-        short = vertices <= MAX_SHORT_VERTICES
-        array = faces.detach().cpu().numpy().reshape(-1).astype("<u2" if short else "<u4")
-        return self._append(
-            "accessors",
-            {
-                "bufferView": self._view(array.tobytes(), INDEX_BUFFER),
-                "componentType": UNSIGNED_SHORT if short else UNSIGNED_INT,
-                "count": len(array),
-                "type": "SCALAR",
-            },
-        )
-
-    def texture(self, name: str, png: bytes) -> Json:
-        """A reference to an embedded PNG, trilinear, clamped at the border."""
-        if not self._lists["samplers"]:
-            sampler: Json = {"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP_LINEAR}
-            self._append("samplers", sampler | {"wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE})
-        image = self._append(
-            "images", {"name": name, "mimeType": "image/png", "bufferView": self._view(png)}
-        )
-        return {"index": self._append("textures", {"sampler": 0, "source": image})}
-
-    def pack(self, document: Json) -> bytes:
-        """The finished file."""
-        full: Json = {"asset": {"version": "2.0", "generator": "svim3d"}} | document
-        full |= {kind: entries for kind, entries in self._lists.items() if entries}
-        binary = bytes(self._content) + b"\0" * (-len(self._content) % ALIGNMENT)
-        full["buffers"] = [{"byteLength": len(binary)}]
-        return pack_glb(full, binary)

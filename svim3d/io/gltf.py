@@ -57,38 +57,46 @@ def read_gltf(file: Path) -> SourceMesh:
     Raises:
         ValueError: the file is damaged, holds no triangles, or needs an unknown extension.
     """
-    document, binary = _read_container(file)
+    return _mesh(file.read_bytes(), file.name, file.parent)
+
+
+def parse_glb(content: bytes) -> SourceMesh:
+    """Read a file that is in memory and refers to no other; see `read_gltf`."""
+    return _mesh(content, "the .glb", Path())
+
+
+def _mesh(content: bytes, name: str, folder: Path) -> SourceMesh:
+    document, binary = _container(content, name)
     unknown = set(document.get("extensionsRequired", [])) - UNDERSTOOD
     if unknown:
         raise ValueError(
-            f"{file.name} needs the glTF extension {', '.join(sorted(unknown))}, which is not "
+            f"{name} needs the glTF extension {', '.join(sorted(unknown))}, which is not "
             "supported; export it without compression"
         )
     try:
-        return _Reader(document, binary, file.parent).mesh()
+        return _Reader(document, binary, folder).mesh()
     except (KeyError, IndexError, struct.error, TypeError, AttributeError) as error:
-        raise ValueError(f"{file.name} is no valid glTF 2.0 file: {error!r}") from error
+        raise ValueError(f"{name} is no valid glTF 2.0 file: {error!r}") from error
 
 
-def _read_container(file: Path) -> tuple[Json, bytes]:
+def _container(content: bytes, name: str) -> tuple[Json, bytes]:
     """The JSON document and, for a GLB, its binary chunk."""
-    content = file.read_bytes()
     if content[:4] != GLB_MAGIC:
         try:
             document: Json = json.loads(content)
         except ValueError as error:
-            raise ValueError(f"{file.name} is neither a GLB nor glTF JSON: {error}") from error
+            raise ValueError(f"{name} is neither a GLB nor glTF JSON: {error}") from error
         return document, b""
     chunks: dict[bytes, bytes] = {}
     offset = 12
     while offset + 8 <= len(content):
         length = struct.unpack_from("<I", content, offset)[0]
         if offset + 8 + length > len(content):
-            raise ValueError(f"{file.name} is cut short: a chunk ends beyond the file")
+            raise ValueError(f"{name} is cut short: a chunk ends beyond the file")
         chunks[content[offset + 4 : offset + 8]] = content[offset + 8 : offset + 8 + length]
         offset += 8 + length
     if JSON_CHUNK not in chunks:
-        raise ValueError(f"{file.name} is a GLB without a JSON chunk")
+        raise ValueError(f"{name} is a GLB without a JSON chunk")
     return json.loads(chunks[JSON_CHUNK]), chunks.get(BINARY_CHUNK, b"")
 
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 from svim3d.cameras import Cameras
@@ -35,6 +36,15 @@ CHANNELS = {
 # Images that are there where all views have them: depth along the camera's -z axis, and how far the
 # view is to be trusted, from 0 to 1.
 OPTIONAL_CHANNELS = {"depth": ("depth.Z",), "confidence": ("confidence.V",)}
+# What the header of every view says of its channels. Source: OpenEXR standard attributes, and
+# colorInteropID of the Color Interop Forum.
+SPACES: dict[str, Any] = {
+    "chromaticities": (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329),  # Rec.709, D65
+    "colorInteropID": "lin_rec709_scene",
+    "comments": "R G B: scene-linear radiance, multiplied by the coverage A; all else is straight. "
+    "basecolor: linear reflectance. roughness.V: perceptual. normal: unit, world space, y up. "
+    "depth.Z: along the camera's -z axis, world units, 0 where nothing is. confidence.V: 0 to 1.",
+}
 INDEX = "orbit.json"
 RIGID_TOLERANCE = 1e-3  # poses written with 4 decimals pass, mirrored or scaled ones do not
 
@@ -63,7 +73,7 @@ def write_orbit(
             for image, channels in named.items()
             for i, channel in enumerate(channels)
         }
-        write_exr(folder / name, planes)
+        write_exr(folder / name, planes, attributes=SPACES | _pose(cameras, view))
         frames.append({"file": name, **_angles(cameras, view), "c2w": cameras.c2w[view].tolist()})
     index = {
         "camera": {
@@ -75,6 +85,12 @@ def write_orbit(
         "frames": frames,
     }
     (folder / INDEX).write_text(json.dumps(index, indent=1))
+
+
+def _pose(cameras: Cameras, view: int) -> dict[str, NDArray[np.float32]]:
+    """The camera as EXR has it: a matrix that row vectors are multiplied with."""
+    w2c = torch.linalg.inv(cameras.c2w[view].double().cpu())
+    return {"worldToCamera": w2c.T.contiguous().float().numpy()}
 
 
 def _angles(cameras: Cameras, view: int) -> dict[str, float]:
@@ -114,6 +130,18 @@ def read_orbit(
     names = [frame["file"] for frame in frames]
     images = _read_views([folder / name for name in names], cameras, wanted)
     return cameras, repair_images(images, names, notify), reference
+
+
+def read_cameras(folder: Path) -> tuple[Cameras, int]:
+    """Poses and reference index of an orbit folder, without its pictures.
+
+    Raises:
+        ValueError: see `read_orbit`.
+    """
+    with _telling_of(folder):
+        index = _read_index(folder)
+        frames = _frames(folder, index, "train")
+        return _cameras(folder, index, frames), _reference(index, len(frames), "train")
 
 
 def read_frame(

@@ -25,6 +25,7 @@ def test_run_folder_holds_products_links_and_page(store, source, tmp_path):
     assert page["stages"]["walk"]["state"] == "computed"
     assert page["stages"]["walk"]["key"] == artifacts["walk"].key
     assert page["stages"]["walk"]["seconds"] >= 0
+    assert page["products"] == {"total.safetensors": product.stat().st_size}
 
 
 def test_products_outlive_the_store(store, source, tmp_path):

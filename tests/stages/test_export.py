@@ -6,12 +6,14 @@ import subprocess
 import pytest
 import torch
 from pydantic import ValidationError
+from sphere_views import of_one_material, sphere_views
 
 from stages import export
 from stages.artifacts import ExportedAsset, FittedField, TexturedMesh
 from stages.base import Context
 from stages.errors import InputError
 from stages.export import EXPORT, run
+from stages.finished_views import ViewFolder
 from stages.settings.export import ExportConfig
 from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
 from svim3d.fields.sdf_grid import node_positions
@@ -62,13 +64,21 @@ def textured():
     )
 
 
+@pytest.fixture(scope="module")
+def views(tmp_path_factory):
+    """Three views that the asset is said to come of."""
+    folder = tmp_path_factory.mktemp("views")
+    sphere_views(of_one_material, views=3, size=24).save(folder)
+    return ViewFolder.load(folder)
+
+
 @pytest.fixture
 def ctx(tmp_path):
     return Context("export", torch.device("cpu"), 0, tmp_path / "work", tmp_path / "shared")
 
 
-def test_textured_mesh_becomes_a_checked_glb(field, textured, ctx):
-    asset = run(field, None, textured, config=ExportConfig(), ctx=ctx)
+def test_textured_mesh_becomes_a_checked_glb(field, textured, ctx, views):
+    asset = run(field, None, textured, views, config=ExportConfig(), ctx=ctx)
     assert set(asset.files) == {"asset.glb", "environment.exr"}
     found = reopen_glb(asset.files["asset.glb"])
     assert torch.equal(found.vertices, textured.vertices)
@@ -78,12 +88,12 @@ def test_textured_mesh_becomes_a_checked_glb(field, textured, ctx):
     assert asset.summary["watertight"] is True
     assert asset.summary["atlas_overlaps"] == 0
     assert asset.summary["glb_bytes"] == len(asset.files["asset.glb"])
-    assert asset == run(field, None, textured, config=ExportConfig(), ctx=ctx)
+    assert asset == run(field, None, textured, views, config=ExportConfig(), ctx=ctx)
 
 
-def test_obj_holds_the_same_mesh(field, textured, ctx, tmp_path):
+def test_obj_holds_the_same_mesh(field, textured, ctx, tmp_path, views):
     config = ExportConfig(formats=("glb", "obj"))
-    asset = run(field, None, textured, config=config, ctx=ctx)
+    asset = run(field, None, textured, views, config=config, ctx=ctx)
     folder = tmp_path / "saved"
     folder.mkdir()
     asset.save(folder)
@@ -95,9 +105,9 @@ def test_obj_holds_the_same_mesh(field, textured, ctx, tmp_path):
     assert torch.equal(glb.materials[0].roughness_metallic, obj.materials[0].roughness_metallic)
 
 
-def test_without_phase_3_vertices_carry_the_field(field, ctx):
+def test_without_phase_3_vertices_carry_the_field(field, ctx, views):
     config = ExportConfig(vertex_color_faces=500)
-    asset = run(field, None, None, config=config, ctx=ctx)
+    asset = run(field, None, None, views, config=config, ctx=ctx)
     found = reopen_glb(asset.files["asset.glb"])
     truth = field.own_surface().material_field(torch.device("cpu"))(found.vertices)
     assert torch.allclose(found.basecolor, truth.basecolor, atol=1e-6)
@@ -108,43 +118,43 @@ def test_without_phase_3_vertices_carry_the_field(field, ctx):
     assert float(signed_volume(found.vertices, found.faces)) == pytest.approx(0.268, rel=0.05)
 
 
-def test_environment_is_that_of_the_last_phase(field, textured, ctx, tmp_path):
+def test_environment_is_that_of_the_last_phase(field, textured, ctx, tmp_path, views):
     surface = dataclasses.replace(field.own_surface(), environment=torch.full((8, 8, 3), 5.0))
     file = tmp_path / "environment.exr"
     for fitted, value in ((None, 2.0), (surface, 5.0)):
-        asset = run(field, fitted, textured, config=ExportConfig(), ctx=ctx)
+        asset = run(field, fitted, textured, views, config=ExportConfig(), ctx=ctx)
         file.write_bytes(asset.files["environment.exr"])
         assert read_rgb(file) == pytest.approx(value)
 
 
-def test_a_glb_that_reads_back_wrong_is_not_published(field, textured, ctx, monkeypatch):
+def test_a_glb_that_reads_back_wrong_is_not_published(field, textured, ctx, monkeypatch, views):
     def swapped(**parts):
         return glb_bytes(**parts | {"orm": parts["orm"].flip(-1)})  # a classic: channel order
 
     monkeypatch.setattr(export, "glb_bytes", swapped)
     with pytest.raises(RuntimeError, match="orm off by"):
-        run(field, None, textured, config=ExportConfig(), ctx=ctx)
+        run(field, None, textured, views, config=ExportConfig(), ctx=ctx)
 
 
-def test_nothing_to_export_is_an_input_error(field, textured, ctx):
+def test_nothing_to_export_is_an_input_error(field, textured, ctx, views):
     empty = dataclasses.replace(textured, faces=torch.zeros(0, 3, dtype=torch.int64))
     with pytest.raises(InputError, match="without faces"):
-        run(field, None, empty, config=ExportConfig(), ctx=ctx)
+        run(field, None, empty, views, config=ExportConfig(), ctx=ctx)
     hollow = dataclasses.replace(field, sdf=-torch.ones(8, 8, 8))
     with pytest.raises(InputError, match="wanted a surface"):
-        run(hollow, None, None, config=ExportConfig(), ctx=ctx)
+        run(hollow, None, None, views, config=ExportConfig(), ctx=ctx)
     with pytest.raises(ValidationError, match='must contain "glb"'):
         ExportConfig(formats=("obj",))
 
 
 @pytest.mark.skipif("GLTF_VALIDATOR" not in os.environ, reason="path of the node module not set")
 @pytest.mark.parametrize("skip", [False, True], ids=["textured", "painted"])
-def test_khronos_validator_has_nothing_to_remark(field, textured, ctx, skip):
+def test_khronos_validator_has_nothing_to_remark(field, textured, ctx, skip, views):
     program = (
         "require(process.argv[1]).validateBytes(new Uint8Array(require('fs').readFileSync(0)))"
         ".then(report => console.log(JSON.stringify(report.issues)))"
     )
-    asset = run(field, None, None if skip else textured, config=ExportConfig(), ctx=ctx)
+    asset = run(field, None, None if skip else textured, views, config=ExportConfig(), ctx=ctx)
     report = subprocess.run(
         ["node", "-e", program, os.environ["GLTF_VALIDATOR"]],
         input=asset.files["asset.glb"],
@@ -156,5 +166,5 @@ def test_khronos_validator_has_nothing_to_remark(field, textured, ctx, skip):
 
 
 def test_inputs_match_the_pipeline():
-    assert list(EXPORT.inputs) == ["field", "surface", "textured"]
+    assert list(EXPORT.inputs) == ["field", "surface", "textured", "views"]
     assert EXPORT.output is ExportedAsset

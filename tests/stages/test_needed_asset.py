@@ -24,6 +24,7 @@ from stages import export, uv_bake
 from stages.artifacts import TexturedMesh
 from stages.base import Context
 from stages.edit import edit_asset
+from stages.finished_views import ViewFolder
 from stages.preview import run as preview
 from stages.relight import run as relight
 from stages.settings.export import ExportConfig
@@ -65,7 +66,10 @@ class Made:
         self._note(context)
         context = self._context(folder, "export")
         settings = ExportConfig(formats=("glb", "obj"), lods=lods)
-        self.asset = export.run(self.field, None, self.mesh, config=settings, ctx=context)
+        # Nothing is asked of the views' folder.
+        self.asset = export.run(
+            self.field, None, self.mesh, ViewFolder(folder), config=settings, ctx=context
+        )
         self._note(context)
         self.glb = self.asset.files["asset.glb"]
         self.file = folder / "asset.glb"
