@@ -14,6 +14,7 @@ from pathlib import Path
 
 from flows.batch_options import batch_options
 from flows.data_options import data_options
+from flows.evaluate_options import evaluate_options
 from flows.model_options import model_options
 from flows.operator_options import (
     ON_END,
@@ -47,6 +48,7 @@ DOERS = {
     "logs": "flows.runs",
     "store": "flows.store",
     "stability": "flows.stability",
+    "evaluate": "flows.evaluate",
 }
 
 # Thread pools that spin while they wait starve each other: two of them on two cores made the
@@ -144,6 +146,11 @@ def _parser() -> argparse.ArgumentParser:
         ),
         ("automations", [shared], "let a Prefect server find and resume runs that were killed"),
         ("stability", [stability_options(), shared], "run the suite of hazards, and report"),
+        (
+            "evaluate",
+            [evaluate_options(), shared],
+            "score assets of a benchmark's objects against the truth",
+        ),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
     ):
