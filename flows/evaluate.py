@@ -32,6 +32,7 @@ from stages.store import Store
 ALL_SCORED, SOME_FAILED = 0, 1
 TRUTHS = "truth"  # folder of converted objects in the output folder
 LEAST_SIZE = 16
+WITHOUT_MATERIALS = ("stanford-orb", "gso")  # whose views no asset can be made of
 Results = dict[str, dict[str, Mapping[str, Any]]]
 Failures = list[tuple[str, str, str]]  # row, object, reason
 
@@ -41,6 +42,11 @@ def evaluate(options: argparse.Namespace) -> int:
     console = Console()
     if options.size < LEAST_SIZE:
         raise InputError(f"--size {options.size}: wanted {LEAST_SIZE} or more pixels")
+    if options.made_from == VIEWS and options.suite in WITHOUT_MATERIALS:
+        raise InputError(
+            f"--from views needs views with materials, which {options.suite} has none of; say "
+            "--from photo"
+        )
     rows = rows_of(options.preset, options.set, options.row)
     suite = _Suite(options, console)
     if options.list:

@@ -39,6 +39,27 @@ def evaluate_options() -> argparse.ArgumentParser:
     options.add_argument(
         "--list", action="store_true", help="name the objects that were found, and run nothing"
     )
+    _add_rows(options)
+    options.add_argument(
+        "--size",
+        type=int,
+        default=256,
+        metavar="PX",
+        help="most rows of views that are converted to our layout (%(default)s)",
+    )
+    options.add_argument(
+        "--limit",
+        type=float,
+        default=7200.0,
+        metavar="S",
+        help="seconds of an object and row (%(default)g)",
+    )
+    add_machine(options)
+    return options
+
+
+def _add_rows(options: argparse.ArgumentParser) -> None:
+    """How assets are made."""
     options.add_argument(
         "--preset",
         default="standard",
@@ -60,19 +81,3 @@ def evaluate_options() -> argparse.ArgumentParser:
         help="one more row with other settings, compared with the first; preset=NAME and "
         "skip=STAGE are settings, too; may be repeated",
     )
-    options.add_argument(
-        "--size",
-        type=int,
-        default=256,
-        metavar="PX",
-        help="most rows of views that are converted to our layout (%(default)s)",
-    )
-    options.add_argument(
-        "--limit",
-        type=float,
-        default=7200.0,
-        metavar="S",
-        help="seconds of an object and row (%(default)g)",
-    )
-    add_machine(options)
-    return options

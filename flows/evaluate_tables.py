@@ -8,6 +8,7 @@ from statistics import fmean
 from typing import Any
 
 AZIMUTH_BINS = 8
+ANY_ROW = "(any)"  # of what all rows have in common
 DRAWN, ASSET, TRUE = "drawn", "asset", "true views"  # subjects of `stages.table_scores`
 REFERENCE, GIVEN, NOVEL, RELIT = "reference", "given", "novel", "relit"
 ORB_ROWS = ("official", "foreground", "unscaled")
@@ -137,11 +138,11 @@ def _lines(
         for subject, figures in maker(pages).items():
             if not any(figures.values()):
                 continue
-            line = Line(row, subject, figures, first.get(subject))
+            is_true = subject.startswith(TRUE)  # they do not depend on how assets are made
+            line = Line(ANY_ROW if is_true else row, subject, figures, first.get(subject))
             if number == 0:
                 first[subject] = line
-            # True views do not depend on how assets are made.
-            if number == 0 or not subject.startswith(TRUE):
+            if number == 0 or not is_true:
                 lines.append(line)
     return lines
 

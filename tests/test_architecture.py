@@ -82,6 +82,7 @@ MAY_IMPORT = {
     ),
     "stages.shared_store": ("stages.store", "stages.keys", "stages.manifest", "stages.errors"),
     "stages.faults": ("stages.errors", "stages.store"),
+    "stages.suites": ("svim3d", "stages.keys", "stages.errors"),
     "stages.time_limit": ("stages.errors",),
     "stages.device_slot": (),
     "stages.execution": (

@@ -95,7 +95,7 @@ def write_truth(truth: ObjectTruth, folder: Path) -> None:
     (folder / INDEX).write_text(json.dumps(index, indent=1))
 
 
-def _camera(cameras: Cameras) -> dict[str, float]:
+def _camera(cameras: Cameras) -> dict[str, int | float]:
     return {"width": cameras.width, "height": cameras.height, "fov_deg": cameras.fov_y_deg}
 
 
