@@ -90,8 +90,12 @@ class _Suite:
         if unknown:
             raise InputError(f"--objects {unknown[0]}: wanted some of {', '.join(found)}")
         self.names = options.objects or found
+        if options.lpips is not None and not options.lpips.is_file():
+            raise InputError(f"--lpips: there is no file {options.lpips}; check the path")
         self._config = TableScoresConfig(
-            from_photo=made_from == PHOTO, stanford_orb=options.suite == "stanford-orb"
+            from_photo=made_from == PHOTO,
+            stanford_orb=options.suite == "stanford-orb",
+            lpips_weights=options.lpips and options.lpips.resolve(),
         )
 
     def subject(self, name: str, failures: Failures, rows: Sequence[Row]) -> Subject | None:

@@ -43,15 +43,15 @@ class Cell:
             return ABSENT
         mean = _number(self.mean.mean, self.digits)
         if self.difference is not None and self.difference.count:
-            told = f"{self.difference.mean:+.{self.digits}f}"
-            return f"{mean} ({told}{self._ends(self.difference, signed=True)})"
+            told = _number(self.difference.mean, self.digits, sign="+")
+            return f"{mean} ({told}{self._ends(self.difference, sign='+')})"
         return f"{mean}{self._ends(self.mean)}"
 
-    def _ends(self, interval: "Interval", *, signed: bool = False) -> str:
+    def _ends(self, interval: "Interval", *, sign: str = "") -> str:
         if interval.count < 2:  # one object tells nothing of others
             return ""
-        form = f"{'+' if signed else ''}.{self.digits}f"
-        return f" [{interval.low:{form}}, {interval.high:{form}}]"
+        low, high = (_number(end, self.digits, sign=sign) for end in (interval.low, interval.high))
+        return f" [{low}, {high}]"
 
 
 def cell(line: Line, figure: str) -> Cell:
@@ -175,8 +175,9 @@ def _object_rows(
     return rows
 
 
-def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else ABSENT
+def _number(value: float, digits: int, *, sign: str = "") -> str:
+    # Adding zero takes the sign of a rounded -0.
+    return f"{round(value, digits) + 0.0:{sign}.{digits}f}" if math.isfinite(value) else ABSENT
 
 
 def _escaped(text: str) -> str:

@@ -48,6 +48,12 @@ def evaluate_options() -> argparse.ArgumentParser:
         help="most rows of views that are converted to our layout (%(default)s)",
     )
     options.add_argument(
+        "--lpips",
+        type=Path,
+        metavar="FILE",
+        help="also tell LPIPS, by these weights: the state of lpips.LPIPS(net='alex' or 'vgg')",
+    )
+    options.add_argument(
         "--limit",
         type=float,
         default=7200.0,

@@ -18,15 +18,21 @@ HEADS = {
     "rgb_ssim": ("RGB, SSIM", 3),
     "basecolor_db": ("basecolor, dB", 2),
     "basecolor_ssim": ("basecolor, SSIM", 3),
+    "rgb_lpips": ("RGB, LPIPS", 3),
+    "rgb_st_lpips": ("RGB, ST-LPIPS", 3),
+    "basecolor_lpips": ("basecolor, LPIPS", 3),
+    "basecolor_st_lpips": ("basecolor, ST-LPIPS", 3),
     "basecolor_scaled_db": ("basecolor scaled, dB", 2),
     "roughness_rmse": ("roughness, RMSE", 3),
     "metallic_rmse": ("metallic, RMSE", 3),
     "normal_deg": ("normals, deg", 1),
     "mask_iou": ("outline, IoU", 3),
     "novel_db": ("novel views, dB", 2),
-    "novel_ssim": ("SSIM", 3),
+    "novel_ssim": ("novel, SSIM", 3),
     "relit_db": ("relit, dB", 2),
     "relit_ssim": ("relit, SSIM", 3),
+    **{f"novel_{n}lpips": (f"novel, {n.upper().replace('_', '-')}LPIPS", 3) for n in ("", "st_")},
+    **{f"relit_{n}lpips": (f"relit, {n.upper().replace('_', '-')}LPIPS", 3) for n in ("", "st_")},
     "chamfer": ("Chamfer", 4),
     "f_0.01": ("F at 0.01", 3),
     "f_0.02": ("F at 0.02", 3),
@@ -38,16 +44,23 @@ HEADS = {
     "psnr_hdr_db": ("PSNR-H", 2),
     "psnr_ldr_db": ("PSNR-L", 2),
     "ssim": ("SSIM", 3),
+    "lpips": ("LPIPS", 3),
 }
 MATERIALS = (
-    *("basecolor_db", "basecolor_ssim", "basecolor_scaled_db"),
+    *("basecolor_db", "basecolor_ssim", "basecolor_lpips", "basecolor_st_lpips"),
+    "basecolor_scaled_db",
     *("roughness_rmse", "metallic_rmse", "normal_deg"),
 )
-VIEWS = ("rgb_db", "rgb_ssim", "basecolor_db", "basecolor_ssim", "normal_deg", "mask_iou")
-IN_3D = ("novel_db", "novel_ssim", "relit_db", "relit_ssim")
+UNITS = ("db", "ssim", "lpips", "st_lpips")
+VIEWS = (
+    *(f"rgb_{unit}" for unit in UNITS),
+    *(f"basecolor_{unit}" for unit in UNITS),
+    *("normal_deg", "mask_iou"),
+)
+IN_3D = tuple(f"{name}_{unit}" for name in ("novel", "relit") for unit in UNITS)
 SURFACE = ("chamfer", "f_0.01", "f_0.02", "f_0.05", "f_0.1", "normal_consistency", "volume_iou")
-ABLATION = (*IN_3D[::2], "basecolor_db", "normal_deg", "chamfer", "cpu_s")
-ORB_FIGURES = ("psnr_hdr_db", "psnr_ldr_db", "ssim")
+ABLATION = ("novel_db", "relit_db", "basecolor_db", "normal_deg", "chamfer", "cpu_s")
+ORB_FIGURES = ("psnr_hdr_db", "psnr_ldr_db", "ssim", "lpips")
 
 # Figures by object.
 Values = dict[str, float]
@@ -190,7 +203,7 @@ def _several_views(pages: Mapping[str, Page]) -> dict[str, dict[str, Values]]:
     for subject in (DRAWN, TRUE):
         lines[f"{subject}, relit in 2.5D"] = _of_pages(
             pages,
-            ("rgb_db", "rgb_ssim"),
+            VIEWS[: len(UNITS)],
             partial(_mean_views, parts=(RELIT,), subject=subject),
         )
     return lines
@@ -209,9 +222,7 @@ def _test_figures(page: Page, subject: str) -> dict[str, float]:
     for name, part in (("novel", NOVEL), ("relit", RELIT)):
         means = _mean_views(page, (part,), subject)
         found |= {
-            f"{name}_{unit}": means[f"rgb_{unit}"]
-            for unit in ("db", "ssim")
-            if f"rgb_{unit}" in means
+            f"{name}_{unit}": means[f"rgb_{unit}"] for unit in UNITS if f"rgb_{unit}" in means
         }
     return found
 

@@ -26,6 +26,8 @@ from stages.truth import SEEN, Truth, read_truth
 from svim3d.cameras import Cameras
 from svim3d.io.exr import read_rgb
 from svim3d.io.glb import read_mesh
+from svim3d.io.weights import load_state
+from svim3d.losses.lpips import Lpips
 from svim3d.mesh.source_mesh import SourceMesh
 from svim3d.metrics import occupancy, volume_iou
 from svim3d.metrics.stanford_orb import compare_pictures
@@ -35,7 +37,7 @@ from svim3d.render.asset_figures import HALF_EXTENT
 from svim3d.render.deferred import environment_shader
 from svim3d.render.framing import Framing
 from svim3d.render.pictures import render_pictures
-from svim3d.render.view_figures import BUFFERS, relit, view_figures
+from svim3d.render.view_figures import BUFFERS, Perceptual, relit, view_figures
 from svim3d.shading.environment import octahedral_from_latlong
 from svim3d.shading.prefilter import EnvironmentPyramid
 
@@ -43,6 +45,7 @@ GLB, LIGHT = "asset.glb", "environment.exr"
 REFERENCE, GIVEN, NOVEL, RELIT = "reference", "given", "novel", "relit"
 DRAWN, ASSET, TRUE = "drawn", "asset", "true views"
 ORB = "orb"
+LPIPS, SHIFT_TOLERANT = "lpips", "st_lpips"
 SAME_DIRECTION = 0.9998  # cosine of a degree
 
 Images = dict[str, Tensor]
@@ -148,6 +151,7 @@ class _Scoring:
         self._found = _found_light(export, ctx)
         # A photo's exposure is in the light that was found of it.
         self._own_gain = 1.0 if config.from_photo else truth.exposure
+        self._perceptual = _perceptual(config.lpips_weights)
 
     def _frame(self) -> Framing:
         if not self._config.from_photo:
@@ -267,17 +271,32 @@ class _Scoring:
     ) -> ViewScore:
         mine, true = ({n: i[view] for n, i in images.items()} for images in (shown, truth))
         own_gain = self._own_gain if gain is None else gain
-        figures = view_figures(mine, true, gain=own_gain, true_gain=self._truth.exposure)
+        figures = view_figures(
+            mine,
+            true,
+            gain=own_gain,
+            true_gain=self._truth.exposure,
+            perceptual=self._perceptual,
+        )
         if self._config.stanford_orb and part in (NOVEL, RELIT):
-            mask = true["mask"] > 0.5
+            mask, learned = true["mask"] > 0.5, self._perceptual
             rows = compare_pictures(
                 mine["radiance"] * own_gain / self._truth.exposure,
                 true["radiance"],
                 mask,
                 scaled=part == RELIT,
+                lpips=None if learned is None or learned.name != LPIPS else learned.distance,
             ).rows
             figures |= {f"{ORB}.{r}.{n}": v for r, row in rows.items() for n, v in row.items()}
         return ViewScore(part, subject, light, _azimuth_deg(cameras, view), figures)
+
+
+def _perceptual(weights: Path | None) -> Perceptual | None:
+    """The distance that a user's weights are of, called by its name."""
+    if weights is None:
+        return None
+    network = Lpips.of(load_state(weights))
+    return Perceptual(SHIFT_TOLERANT if network.is_shift_tolerant else LPIPS, network)
 
 
 def _subset(views: MaterialViews, chosen: list[int]) -> tuple[Cameras, Images]:

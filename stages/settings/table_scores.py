@@ -1,11 +1,13 @@
 """Settings of the figures behind tables."""
 
+from pathlib import Path
+
 from pydantic import Field
 
-from stages.settings.base import StageConfig
+from stages.settings.base import FileReadingConfig
 
 
-class TableScoresConfig(StageConfig):
+class TableScoresConfig(FileReadingConfig):
     """How finely an asset is compared; figures of other settings do not compare."""
 
     surface_samples: int = Field(default=100_000, ge=100, le=10_000_000)
@@ -26,3 +28,7 @@ class TableScoresConfig(StageConfig):
 
     stanford_orb: bool = False
     """Whether test views are scored by Stanford-ORB's rules, too."""
+
+    lpips_weights: Path | None = None
+    """State of `lpips.LPIPS(net='alex')` or of another of its networks, backbone included, or of
+    the shift-tolerant kind; None leaves the figure out."""

@@ -4,7 +4,10 @@ All figures run over the true mask (> 0.5). Pictures are clipped to [0, 1] and s
 photo of theirs would be; where a view shows nothing, it is black there.
 """
 
-from jaxtyping import Float
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from svim3d.cameras import Cameras
@@ -23,7 +26,27 @@ Picture = dict[str, Float[Tensor, "_ _ _"]]
 Figures = dict[str, float]
 
 
-def view_figures(shown: Picture, truth: Picture, *, gain: float, true_gain: float) -> Figures:
+@dataclass(frozen=True)
+class Perceptual:
+    """A learned distance of pictures, and what it is called.
+
+    Attributes:
+        name: `lpips` or `st_lpips`.
+        distance: mean over pairs of encoded pictures [N, H, W, 3].
+    """
+
+    name: str
+    distance: Callable[[Tensor, Tensor], Tensor]
+
+
+def view_figures(
+    shown: Picture,
+    truth: Picture,
+    *,
+    gain: float,
+    true_gain: float,
+    perceptual: Perceptual | None = None,
+) -> Figures:
     """What can be told of a view: of each image that both have.
 
     Args:
@@ -32,6 +55,7 @@ def view_figures(shown: Picture, truth: Picture, *, gain: float, true_gain: floa
         truth: the same.
         gain: exposure of the shown radiance.
         true_gain: exposure of the true one.
+        perceptual: adds `rgb_lpips` and `basecolor_lpips`, named after it.
 
     Returns:
         `rgb_db`, `rgb_ssim`, `basecolor_db`, `basecolor_ssim`, `basecolor_scaled_db` (after a least
@@ -45,11 +69,11 @@ def view_figures(shown: Picture, truth: Picture, *, gain: float, true_gain: floa
     cover = shown["mask"]
     if "radiance" in both:
         pair = _encoded(shown["radiance"] * gain), _encoded(truth["radiance"] * true_gain)
-        figures |= {"rgb_db": psnr(*pair, mask), "rgb_ssim": _ssim(*pair, mask)}
+        figures |= _picture_figures("rgb", *pair, mask, perceptual)
     if "basecolor" in both:
         laid, true = shown["basecolor"] * cover, truth["basecolor"] * (truth["mask"] > 0)
         pair = _encoded(laid), _encoded(true)
-        figures |= {"basecolor_db": psnr(*pair, mask), "basecolor_ssim": _ssim(*pair, mask)}
+        figures |= _picture_figures("basecolor", *pair, mask, perceptual)
         scaled = _encoded(align_scale(laid, true, mask))
         figures["basecolor_scaled_db"] = psnr(scaled, pair[1], mask)
     for name in both & {"roughness", "metallic"}:
@@ -77,7 +101,19 @@ def _encoded(linear: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
     return srgb_from_linear(linear.clamp(0.0, 1.0))
 
 
-def _ssim(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], mask: Tensor) -> float:
-    """Mean inside the mask, of pictures that are black outside the true one."""
-    laid, true = image * mask, truth * mask
-    return float(structural_similarity(laid[None], true[None])[0][mask].mean())
+def _picture_figures(
+    name: str,
+    image: Float[Tensor, "H W 3"],
+    truth: Float[Tensor, "H W 3"],
+    mask: Bool[Tensor, "H W 1"],
+    perceptual: Perceptual | None,
+) -> Figures:
+    """PSNR and SSIM inside the mask, the latter and LPIPS of pictures that are black outside."""
+    laid, true = ((x * mask)[None] for x in (image, truth))
+    figures = {
+        f"{name}_db": psnr(image, truth, mask),
+        f"{name}_ssim": float(structural_similarity(laid, true)[0][mask].mean()),
+    }
+    if perceptual is not None:
+        figures[f"{name}_{perceptual.name}"] = float(perceptual.distance(laid, true))
+    return figures

@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from lpips_weights import blank_state, formula_weights
 from scored_sphere import COLOUR, LIGHTS, ball_asset, plain_images, write_truth
 from sphere_orbit import sphere_cameras
 
@@ -12,6 +13,7 @@ from stages.settings.table_scores import TableScoresConfig
 from stages.table_scores import TableScores, run
 from svim3d.io.exr import read_rgb, write_rgb
 from svim3d.io.orbit import read_orbit
+from svim3d.io.weights import save_tensors
 
 TINY = TableScoresConfig(surface_samples=2000, volume_cells=24, supersample=2, light_size=16)
 SIZE = 32
@@ -178,3 +180,17 @@ def test_the_found_light_lights_the_given_views(truth, tmp_path, ctx):
     )
     pair = [scores_of(s, "relit", "asset", "rgb_db") for s in (one, other)]
     assert pair[0] == pair[1]
+
+
+@pytest.mark.parametrize(("kind", "name"), [("alex", "lpips"), ("shift tolerant", "st_lpips")])
+def test_lpips_is_told_where_there_are_weights(kind, name, truth, tmp_path, ctx):
+    file = tmp_path / "lpips.safetensors"
+    save_tensors(file, formula_weights(blank_state("alex", kind)))
+    config = TableScoresConfig(
+        surface_samples=500, volume_cells=8, supersample=1, light_size=16, lpips_weights=file
+    )
+    assert set(config.digests) == {"lpips_weights"}
+    scores = run(truth, lit_asset(tmp_path), views_of(truth), None, config=config, ctx=ctx)
+    figures = scores_of(scores, "relit", "asset", f"rgb_{name}")
+    assert len(figures) == 4 and min(figures) > 0.0
+    assert all(f"basecolor_{name}" in v.figures for v in scores.views if v.part == "given")

@@ -5,7 +5,7 @@ import torch
 from sphere_orbit import sphere_cameras, sphere_images
 
 from svim3d.color import srgb_from_linear
-from svim3d.render.view_figures import relit, view_figures
+from svim3d.render.view_figures import Perceptual, relit, view_figures
 from svim3d.shading.prefilter import PyramidOperator
 
 
@@ -79,3 +79,23 @@ def test_rough_plastic_in_even_light_shows_its_basecolor(seen):
     # A dielectric's layer takes from the base what it reflects: a few per cent of white.
     assert 0.9 < float(ratio.median()) < 1.1
     assert float(shown[~inside].abs().max()) == 0.0
+
+
+def test_a_learned_distance_is_called_by_its_name(seen):
+    truth = one_view(seen[1])
+    asked = []
+
+    def distance(image, true):
+        asked.append((image, true))
+        return (image - true).abs().mean()
+
+    shown = truth | {"radiance": 0.0 * truth["radiance"]}
+    figures = view_figures(
+        shown, truth, gain=1.0, true_gain=1.0, perceptual=Perceptual("st_lpips", distance)
+    )
+    mask = (truth["mask"] > 0.5).expand(-1, -1, 3)
+    encoded = torch.where(mask, srgb_from_linear(truth["radiance"].clamp(0, 1)), 0.0)
+    assert figures["rgb_st_lpips"] == pytest.approx(float(encoded.mean()), rel=1e-5)
+    assert figures["basecolor_st_lpips"] == 0.0
+    # Outside the true mask all is black.
+    assert all(float((image[0] * ~mask).abs().max()) == 0.0 for pair in asked for image in pair)
