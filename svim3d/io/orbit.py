@@ -158,11 +158,21 @@ def _listed_camera(file: Path) -> Cameras | None:
         if not (folder / INDEX).is_file():
             continue
         index = _read_index(folder)
-        for frame in (f for key in ("frames", "train", "test") for f in index.get(key, [])):
-            for name in (frame.get("file"), *frame.get("files", {}).values()):
-                if name is not None and (folder / name).resolve() == file.resolve():
-                    return _cameras(folder, index, [{"file": name, "c2w": frame["c2w"]}])
+        for split, name, frame in _listed_files(index):
+            if (folder / name).resolve() == file.resolve():
+                entry = {"file": name, "c2w": frame["c2w"]}
+                return _cameras(folder, _of_split(index, split), [entry])
     return None
+
+
+def _listed_files(index: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Split, file and frame of everything that an index lists."""
+    for key in ("frames", "train", "test"):
+        for frame in index.get(key, []):
+            if "file" in frame:
+                yield "train", frame["file"], frame
+            for environment, name in frame.get("files", {}).items():
+                yield f"test_{environment}", name, frame
 
 
 def _read_index(folder: Path) -> dict[str, Any]:
