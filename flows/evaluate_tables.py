@@ -49,7 +49,7 @@ HEADS = {
 MATERIALS = (
     *("basecolor_db", "basecolor_ssim", "basecolor_lpips", "basecolor_st_lpips"),
     "basecolor_scaled_db",
-    *("roughness_rmse", "metallic_rmse", "normal_deg"),
+    *("roughness_rmse", "metallic_rmse", "normal_deg", "mask_iou"),
 )
 UNITS = ("db", "ssim", "lpips", "st_lpips")
 VIEWS = (
