@@ -170,8 +170,8 @@ def _object_rows(
             for view in page["views"]:
                 where = (view["part"], view["subject"], view["light"], view["azimuth_deg"])
                 rows += [(row, name, *where, f, v) for f, v in view["figures"].items()]
-            for part in ("surface", "cost"):
-                rows += [(row, name, part, "asset", "", "", f, v) for f, v in page[part].items()]
+            for part, of in (("surface", "asset"), ("agreement", "drawn"), ("cost", "asset")):
+                rows += [(row, name, part, of, "", "", f, v) for f, v in page[part].items()]
     return rows
 
 

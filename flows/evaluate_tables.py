@@ -33,6 +33,8 @@ HEADS = {
     "relit_ssim": ("relit, SSIM", 3),
     **{f"novel_{n}lpips": (f"novel, {n.upper().replace('_', '-')}LPIPS", 3) for n in ("", "st_")},
     **{f"relit_{n}lpips": (f"relit, {n.upper().replace('_', '-')}LPIPS", 3) for n in ("", "st_")},
+    "apart": ("neighbours apart", 3),
+    "compared": ("of pixels", 2),
     "chamfer": ("Chamfer", 4),
     "f_0.01": ("F at 0.01", 3),
     "f_0.02": ("F at 0.02", 3),
@@ -55,7 +57,7 @@ UNITS = ("db", "ssim", "lpips", "st_lpips")
 VIEWS = (
     *(f"rgb_{unit}" for unit in UNITS),
     *(f"basecolor_{unit}" for unit in UNITS),
-    *("normal_deg", "mask_iou"),
+    *("normal_deg", "mask_iou", "apart", "compared"),
 )
 IN_3D = tuple(f"{name}_{unit}" for name in ("novel", "relit") for unit in UNITS)
 SURFACE = ("chamfer", "f_0.01", "f_0.02", "f_0.05", "f_0.1", "normal_consistency", "volume_iou")
@@ -200,6 +202,8 @@ def _by_subject(
 def _several_views(pages: Mapping[str, Page]) -> dict[str, dict[str, Values]]:
     """The other training views, and test views that were relit in image space."""
     lines = _by_subject(pages, (GIVEN,), VIEWS)
+    agreement = _of_pages(pages, VIEWS[-2:], lambda page: page["agreement"])
+    lines[DRAWN] |= {name: values for name, values in agreement.items() if values}
     for subject in (DRAWN, TRUE):
         lines[f"{subject}, relit in 2.5D"] = _of_pages(
             pages,

@@ -24,6 +24,7 @@ from stages.prefilter_cache import cached_operator
 from stages.settings.table_scores import TableScoresConfig
 from stages.truth import SEEN, Truth, read_truth
 from svim3d.cameras import Cameras
+from svim3d.color import srgb_from_linear
 from svim3d.io.exr import read_rgb
 from svim3d.io.glb import read_mesh
 from svim3d.io.weights import load_state
@@ -37,7 +38,8 @@ from svim3d.render.asset_figures import HALF_EXTENT
 from svim3d.render.deferred import environment_shader
 from svim3d.render.framing import Framing
 from svim3d.render.pictures import render_pictures
-from svim3d.render.view_figures import BUFFERS, Perceptual, relit, view_figures
+from svim3d.render.view_consistency import mesh_depth, view_consistency
+from svim3d.render.view_figures import BUFFERS, COVERED, Perceptual, relit, view_figures
 from svim3d.shading.environment import octahedral_from_latlong
 from svim3d.shading.prefilter import EnvironmentPyramid
 
@@ -79,11 +81,15 @@ class TableScores:
         views: of each view and subject.
         surface: Chamfer distance, F-scores, consistency of normals, overlap of volumes; empty where
             nobody knows the true surface.
+        agreement: of drawn views with each other where the asset's surface shows the same points
+            to neighbours: `apart`, the mean difference of sRGB basecolor, and `compared`, the
+            share of pixels that were; empty for true views.
         framing: scale of the asset in the truth's frame.
     """
 
     views: list[ViewScore]
     surface: dict[str, float]
+    agreement: dict[str, float]
     framing: float
 
     def save(self, folder: Path) -> None:
@@ -94,7 +100,7 @@ class TableScores:
     def load(cls, folder: Path) -> Self:
         """Read it."""
         page = json.loads((folder / "scores.json").read_text())
-        return cls([ViewScore(**v) for v in page["views"]], page["surface"], page["framing"])
+        return cls(**page | {"views": [ViewScore(**view) for view in page["views"]]})
 
     def headline(self) -> str:
         """How many views were scored."""
@@ -126,7 +132,9 @@ def run(
     try:
         known = read_truth(truth)
         scoring = _Scoring(known, export, generation, novel, config, ctx)
-        return TableScores(list(scoring.views()), scoring.surface(), scoring.framing.scale)
+        return TableScores(
+            list(scoring.views()), scoring.surface(), scoring.agreement(), scoring.framing.scale
+        )
     except ValueError as error:
         raise InputError(f"{truth.name}: {error}") from error
 
@@ -147,7 +155,8 @@ class _Scoring:
         self._generation, self._novel = generation, novel
         self._operator = cached_operator(ctx.shared, config.light_size)
         self.framing = self._frame()
-        self._mesh = self.framing.place(_mesh(export, ctx))
+        self._own_mesh = _mesh(export, ctx)
+        self._mesh = self.framing.place(self._own_mesh)
         self._found = _found_light(export, ctx)
         # A photo's exposure is in the light that was found of it.
         self._own_gain = 1.0 if config.from_photo else truth.exposure
@@ -195,6 +204,17 @@ class _Scoring:
             "normal_consistency": agreement.normal_consistency,
             "volume_iou": volume_iou(*volumes),
         }
+
+    def agreement(self) -> dict[str, float]:
+        """How well drawn views agree with each other, whatever the truth."""
+        if not self._config.from_photo:
+            return {}
+        views, mesh = self._generation, self._own_mesh
+        depth, covered = mesh_depth(mesh.vertices, mesh.faces, views.cameras)
+        mask = covered & (views.mask > COVERED)
+        basecolor = srgb_from_linear(views.basecolor.clamp(0.0, 1.0))
+        found = view_consistency(basecolor, depth, mask, views.cameras)
+        return {"apart": found.error, "compared": found.share}
 
     def _pyramid(self, latlong: Tensor) -> EnvironmentPyramid:
         return self._operator(octahedral_from_latlong(latlong, self._config.light_size))
@@ -279,7 +299,7 @@ class _Scoring:
             perceptual=self._perceptual,
         )
         if self._config.stanford_orb and part in (NOVEL, RELIT):
-            mask, learned = true["mask"] > 0.5, self._perceptual
+            mask, learned = true["mask"] > COVERED, self._perceptual
             rows = compare_pictures(
                 mine["radiance"] * own_gain / self._truth.exposure,
                 true["radiance"],

@@ -1,11 +1,12 @@
 import json
+from pathlib import Path
 
 import pytest
 from scored_sphere import write_truth
 from suite_folders import write_renders
 
 from flows import evaluate as command
-from flows.cli import main
+from flows.cli import _parser, main
 from flows.evaluate_cases import Row, Subject, known_scores, plan_case, rows_of, run_case
 from stages.errors import InputError
 from stages.settings.table_scores import TableScoresConfig
@@ -36,7 +37,7 @@ def scores(level):
     figures = {"rgb_db": level, "basecolor_db": level}
     keys = ("part", "subject", "light", "azimuth_deg", "figures")
     views = [dict(zip(keys, ("reference", "asset", "A", 0.0, figures), strict=True))]
-    return {"views": views, "surface": {"chamfer": 0.01}, "framing": 1.0}
+    return {"views": views, "surface": {"chamfer": 0.01}, "agreement": {}, "framing": 1.0}
 
 
 class _Scores:
@@ -208,3 +209,12 @@ def test_a_broken_case_says_why(suite, tmp_path):
     told = run_case(case, from_photo=False, seed=0, device="cpu", store=store, limit_s=100.0)
     assert told.startswith("generation: ")
     assert known_scores(case, store) is None
+
+
+def test_commands_of_the_guide_are_understood():
+    guide = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text()
+    commands = [line for line in guide.splitlines() if line.startswith("svim3d evaluate ")]
+    assert len(commands) >= 3
+    for line in commands:
+        options = _parser().parse_args(line.split()[1:])
+        assert rows_of(options.preset, options.set, options.row)[0].name == options.preset

@@ -35,6 +35,7 @@ def page(level, *, drawn=False):
     return {
         "views": views,
         "surface": {"chamfer": 0.01 * level, "f_0.1": 1.0},
+        "agreement": {"apart": 0.02, "compared": 0.5} if drawn else {},
         "framing": 1.0,
         "cost": {"seconds": 2.0, "cpu_s": 3.0},
     }
@@ -81,7 +82,9 @@ def test_one_row_has_no_ablation_and_only_drawn_views_are_told_as_drawn():
     names = [t.name for t in tables_of(alone, {})]
     assert "ablation" not in names
     assert "stanford-orb" not in names
-    assert line("views", "standard", "drawn", alone).figures["rgb_db"] == {"cat": 12.0}
+    drawn = line("views", "standard", "drawn", alone)
+    assert drawn.figures["rgb_db"] == {"cat": 12.0}
+    assert drawn.figures["apart"] == {"cat": 0.02}
     relit = line("views", "standard", "drawn, relit in 2.5D", alone)
     assert relit.figures["rgb_db"] == {"cat": 11.0}
     assert not any(x.subject == "drawn" for x in table("views").lines)

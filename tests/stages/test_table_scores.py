@@ -65,6 +65,7 @@ def test_the_true_asset_is_right_everywhere(truth, tmp_path, ctx):
     assert scores.surface["chamfer"] < 1e-4
     assert scores.surface["f_0.01"] == 1.0
     assert scores.surface["volume_iou"] == 1.0
+    assert scores.agreement == {}
     parts = {(view.part, view.subject, view.light) for view in scores.views}
     assert parts == {
         ("reference", "asset", "A"),
@@ -109,6 +110,9 @@ def test_a_photo_s_asset_is_laid_over_the_truth(truth, tmp_path, ctx):
     assert scores.surface["chamfer"] < 1e-3
     assert min(scores_of(scores, "given", "drawn", "basecolor_db")) > 40
     assert min(scores_of(scores, "reference", "drawn", "rgb_db")) > 40
+    # Of one colour, so that neighbours agree but for pixels of the rim.
+    assert scores.agreement["apart"] < 0.02
+    assert 0.05 < scores.agreement["compared"] < 1.0
 
 
 def test_what_was_drawn_at_test_cameras_is_relit(truth, tmp_path, ctx):
