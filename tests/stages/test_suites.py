@@ -133,6 +133,11 @@ def test_larger_pictures_are_averaged_down(tmp_path):
     truth = read_truth(truth_folder("poly-haven", tmp_path / "in", "ball", tmp_path / "out", 12))
     cameras, images, _ = truth.given
     assert images["mask"].shape == (4, 12, 12, 1)
+    # Nothing of the background gets into maps, and normals stay unit.
+    seen = images["mask"][..., 0] > 0.1
+    assert torch.allclose(images["roughness"][seen], torch.tensor(0.5), atol=0.01)
+    length = images["normal_world"][seen].norm(dim=-1)
+    assert torch.allclose(length, torch.ones_like(length), atol=2e-3)
     assert cameras.fov_y_deg == pytest.approx(33.8, abs=1e-4)
 
 

@@ -1,5 +1,6 @@
 """From frames with pictures, maps and lights to the truth of an object."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,8 @@ from svim3d.io.suites.blender_frames import (
     silhouette_box,
     zoomed,
 )
-from svim3d.io.suites.truth_folder import LitPictures, ObjectTruth
+from svim3d.io.suites.truth_folder import MIN_COVERAGE, LitPictures, ObjectTruth
+from svim3d.numerics import normalize
 from svim3d.shading.environment import direction_from_latlong, sample_latlong
 
 LIGHT_ROWS = 128  # of converted lights, twice as many columns
@@ -71,21 +73,20 @@ def object_truth(
     photo = read_radiance(given[0].image, given[0].mask)
     # The photo's view is the last one, as in all orbits.
     ordered = [*given[1:], given[0]]
-    pictures = [read_radiance(p.image, p.mask) for p in ordered]
     if mesh is None:
-        box = silhouette_box([p.frame for p in ordered], [mask for _, mask in pictures])
-        ours = OurFrame.of(given[0].frame.pose, *box)
+        masks = [shrunk(read_radiance(p.image, p.mask)[1], size) for p in ordered]
+        ours = OurFrame.of(given[0].frame.pose, *silhouette_box([p.frame for p in ordered], masks))
     else:
         ours = OurFrame.of(given[0].frame.pose, mesh[0].amin(0), mesh[0].amax(0))
         ours = ours.scaled_to(mesh[0])
-    views = _views(ordered, pictures, ours, size)
+    views = _views(ordered, ours, size)
     is_hdr = given[0].image.suffix.lower() == ".exr"
     return ObjectTruth(
         given=views,
         tests={
-            name: _views(t, [read_radiance(p.image, p.mask) for p in t], ours, size, turn_light)
-            for name, t in tests.items()
-            if t
+            name: _views(pictures, ours, size, turn_light)
+            for name, pictures in tests.items()
+            if pictures
         },
         photo=(shrunk(photo[0], PHOTO_PX), shrunk(photo[1], PHOTO_PX)),
         exposure=exposure_of(views.images, len(given) - 1, is_hdr=is_hdr),
@@ -95,38 +96,40 @@ def object_truth(
 
 def _views(
     pictures: Sequence[Picture],
-    radiances: Sequence[tuple[Tensor, Tensor]],
     ours: OurFrame,
     size: int,
     turn_light: LightTurn | None = None,
 ) -> LitPictures:
     """Images of some views, each seen with the first one's field of view."""
-    fields_of_view = [p.frame.fov_x for p in pictures]
-    wanted = torch.tensor(fields_of_view[0])
-    factors = [float((0.5 * wanted).tan() / torch.tensor(0.5 * f).tan()) for f in fields_of_view]
-
-    def fitted(image: Tensor, view: int) -> Tensor:
-        return zoomed(shrunk(image, size), factors[view])
-
-    images: dict[str, list[Tensor]] = {"radiance": [], "mask": []}
-    for view, (radiance, mask) in enumerate(radiances):
-        images["radiance"].append(fitted(radiance, view))
-        images["mask"].append(fitted(mask, view))
-    shared = set.intersection(*({name for name, _, _ in p.maps} for p in pictures))
-    for name in sorted(shared):
-        images[name] = [
-            fitted(_map(picture, name, mask, ours), view)
-            for view, (picture, (_, mask)) in enumerate(zip(pictures, radiances, strict=True))
-        ]
-    shapes = {image.shape[:2] for image in images["radiance"]}
+    names = set.intersection(*({name for name, _, _ in p.maps} for p in pictures))
+    fov_x = pictures[0].frame.fov_x
+    views = [_images(picture, sorted(names), ours, size, fov_x) for picture in pictures]
+    shapes = sorted({tuple(view["mask"].shape[:2]) for view in views})
     if len(shapes) != 1:
-        raise ValueError(f"wanted pictures of one size, got {sorted(tuple(s) for s in shapes)}")
-    height, width = shapes.pop()
-    cameras = ours.cameras([p.frame for p in pictures], height, width)
-    # Straight values mean something where the object is.
-    cover = (torch.stack(images["mask"]) > 0).float()
-    stacked = {n: torch.stack(i) * (1.0 if n == "mask" else cover) for n, i in images.items()}
-    return LitPictures(cameras, stacked, _lights(pictures, ours, turn_light))
+        raise ValueError(f"wanted pictures of one size, got {shapes}")
+    cameras = ours.cameras([p.frame for p in pictures], *shapes[0])
+    images = {name: torch.stack([view[name] for view in views]) for name in views[0]}
+    return LitPictures(cameras, images, _lights(pictures, ours, turn_light))
+
+
+def _images(
+    picture: Picture, names: Sequence[str], ours: OurFrame, size: int, fov_x: float
+) -> dict[str, Tensor]:
+    """One view, read and made small before the next: captures have hundreds of large ones."""
+    factor = math.tan(0.5 * fov_x) / math.tan(0.5 * picture.frame.fov_x)
+
+    def fitted(image: Tensor) -> Tensor:
+        return zoomed(shrunk(image, size), factor)
+
+    radiance, mask = read_radiance(picture.image, picture.mask)
+    cover = fitted(mask)
+    images = {"radiance": fitted(radiance), "mask": cover}
+    for name in names:
+        # Averaged with their coverage, so that nothing of the background gets in.
+        laid = fitted(_map(picture, name, mask, ours) * mask)
+        straight = laid / cover.clamp_min(MIN_COVERAGE) * (cover > 0)
+        images[name] = normalize(straight) * (cover > 0) if name == "normal_world" else straight
+    return images
 
 
 def _map(picture: Picture, name: str, mask: Tensor, ours: OurFrame) -> Tensor:
