@@ -1,7 +1,8 @@
 """Scenes of the capacity benchmark: orbits with a known truth, from the simplest to the hardest.
 
 Procedural ones are rendered here, without shadows and multiple scattering, as the figures of
-`evaluate_asset.py` assume; orbits of the data folder are averaged down to the size asked for.
+`svim3d.render.asset_figures` assume; orbits of the data folder are averaged down to the size asked
+for.
 """
 
 import json

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 from flows.batch_options import batch_options
 from flows.data_options import data_options
+from flows.evaluate_options import evaluate_options
 from flows.model_options import model_options
 from flows.operator_options import (
     ON_END,
@@ -52,6 +53,7 @@ DOERS = {
     "logs": "flows.runs",
     "store": "flows.store",
     "stability": "flows.stability",
+    "evaluate": "flows.evaluate",
 }
 
 # Thread pools that spin while they wait starve each other: two of them on two cores made the
@@ -141,6 +143,11 @@ def _parser() -> argparse.ArgumentParser:
         ),
         ("automations", [shared], "let a Prefect server find and resume runs that were killed"),
         ("stability", [stability_options(), shared], "run the suite of hazards, and report"),
+        (
+            "evaluate",
+            [evaluate_options(), shared],
+            "score assets of a benchmark's objects against the truth",
+        ),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
     ):

@@ -1,16 +1,15 @@
 """Cases of the stability suite: what is run, by which settings, and what is known already."""
 
 import json
-import os
-import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from flows.case_process import Outcome as Outcome
+from flows.case_process import ended
 from flows.config import PipelineConfig, load_config
 from flows.pipeline import IMAGE_TO_ASSET
 from flows.stability_options import TINY
@@ -18,7 +17,6 @@ from stages.keys import code_digests, digest_json, library_versions
 
 RESULTS = "results.jsonl"
 CASE_MODULE, TRIAL_MODULE = "flows.stability_case", "stages.hazard_trial"
-LAST_LINES = 3  # of what a crashed process said
 
 # About eight CPU seconds a case with all phases, of which two are the start of the process.
 TINY_SETTINGS = (
@@ -51,15 +49,6 @@ PLAIN = (
     "uv_bake.correct_views=false",
 )
 OURS, BASELINE = "ours", "plain"
-
-
-class Outcome(StrEnum):
-    """How the process of a case ended."""
-
-    ASSET = "asset"
-    REFUSED = "refused"  # with an error that says what was wanted, what came, what to do
-    CRASHED = "crashed"
-    TOO_LONG = "too long"
 
 
 @dataclass(frozen=True)
@@ -191,25 +180,5 @@ def run_case(case: Case, settings: Settings) -> dict[str, Any]:
         }
         file = Path(work) / "request.json"
         file.write_text(json.dumps(request))
-        ended = _ended([sys.executable, "-m", CASE_MODULE, str(file)], settings.limit_s)
-        return json.loads(out.read_text()) if out.exists() else ended
-
-
-def _ended(command: Sequence[str], limit_s: float) -> dict[str, Any]:
-    """Run a command; how it ended if it leaves no result."""
-    root = Path(__file__).resolve().parents[1]
-    path = os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])
-    try:
-        done = subprocess.run(
-            command,
-            env=os.environ | {"PYTHONPATH": path},
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            timeout=limit_s,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return {"outcome": Outcome.TOO_LONG, "error": f"more than {limit_s:g} s"}
-    said = " / ".join(done.stderr.strip().splitlines()[-LAST_LINES:])
-    return {"outcome": Outcome.CRASHED, "error": f"ended with {done.returncode}: {said}"}
+        failed = ended([sys.executable, "-m", CASE_MODULE, str(file)], settings.limit_s)
+        return json.loads(out.read_text()) if out.exists() else failed

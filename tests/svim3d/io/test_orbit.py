@@ -5,7 +5,7 @@ import torch
 from sphere_orbit import sphere_cameras, sphere_images
 
 from svim3d.io.exr import read_exr, write_exr
-from svim3d.io.orbit import CHANNELS, read_orbit, write_orbit
+from svim3d.io.orbit import CHANNELS, read_frame, read_orbit, write_orbit
 from svim3d.io.orbit_repair import admit_views, repair_images
 
 
@@ -118,3 +118,43 @@ def test_path_traced_orbit_needs_no_repair(data, split):
     if split == "train":
         assert len(admit_views(cameras, images, reference, lambda *e: told.append(e))[0]) == 21
         assert not told
+
+
+def benchmark(folder, **more):
+    """Three views; only the last two are lit by B, and seen with another lens."""
+    cameras = sphere_cameras(3, 12)
+    write_orbit(folder, cameras, sphere_images(cameras), reference=2)
+    index = json.loads((folder / "orbit.json").read_text())
+    frames = index.pop("frames")
+    for number, frame in enumerate(frames):
+        file = frame.pop("file")
+        frame["files"] = {"A": file} | ({"B": file} if number else {})
+    camera = index["camera"] | {"fov_deg": 20.0}
+    page = index | {"test": frames, "cameras": {"test_B": camera}} | more
+    (folder / "orbit.json").write_text(json.dumps(page))
+    return cameras
+
+
+def test_test_views_may_be_lit_otherwise_and_seen_with_another_lens(tmp_path):
+    cameras = benchmark(tmp_path)
+    all_views, images, _ = read_orbit(tmp_path, "test_A")
+    assert len(all_views) == 3 and all_views.fov_y_deg == 33.8
+    some, lit, _ = read_orbit(tmp_path, "test_B")
+    assert some.fov_y_deg == 20.0
+    assert torch.equal(some.c2w, cameras.c2w[1:])
+    assert torch.equal(lit["radiance"], images["radiance"][1:])
+    with pytest.raises(ValueError, match="wanted a file"):
+        read_orbit(tmp_path, "test_C")
+
+
+def test_a_frame_by_itself_has_the_lens_of_its_split(tmp_path):
+    benchmark(tmp_path)
+    assumed = sphere_cameras(1, 12)
+    lenses = [read_frame(tmp_path / f"{n:03d}.exr", assumed, wanted=["mask"])[0] for n in (0, 2)]
+    # The last view is listed for A first.
+    assert [camera.fov_y_deg for camera in lenses] == [33.8, 33.8]
+    index = json.loads((tmp_path / "orbit.json").read_text())
+    del index["test"][2]["files"]["A"]
+    (tmp_path / "orbit.json").write_text(json.dumps(index))
+    camera, _ = read_frame(tmp_path / "002.exr", assumed, wanted=["mask"])
+    assert camera.fov_y_deg == 20.0
