@@ -23,6 +23,7 @@ import single_file
 import torch
 from drawn_sphere import drawn_sphere
 from safetensors.torch import save_file
+from scored_sphere import write_truth
 from sphere_orbit import sphere_cameras, sphere_images
 from tiny_asset import TINY_ASSET
 from tiny_model import TINY
@@ -70,6 +71,7 @@ ADDED = {
     "relight": ["--size", "48", "--orbit-views", "6", "--device", "cpu"],
     "data": ["--objects", "2", "--size", "16", "--views", "5", "--lights", "2", "--workers", "1"],
     "train": [*SMALL_TRAINING, "--device", "cpu"],
+    "evaluate": SMALL_ASSET,
     "stability": ["--size", "32", "--views", "4", *SMALL_ASSET],
 }
 STORELESS = ("presets", "model")
@@ -118,6 +120,7 @@ def desk(tmp_path: Path, monkeypatch) -> Path:
     write_png(desk / "photos" / "lamp.png", photo.flip(1))
     cameras = sphere_cameras()
     write_orbit(desk / "views", cameras, sphere_images(cameras), reference=len(cameras) - 1)
+    write_truth(desk / "data" / "orbits" / "ball", size=16)
     for folder in ("glbs", "hdris"):
         (desk / folder).mkdir()
     for file in ("chair.glb", "glbs/chair.glb"):
