@@ -142,6 +142,7 @@ def _latex(tables: Sequence[Table], cells: Cells, told: Sequence[str]) -> str:
             row = " & ".join([_escaped(line.row), _escaped(line.subject), *means])
             lines.append(f"{row} \\\\")
         lines += ["\\bottomrule", "\\end{tabular}", "\\end{table}"]
+        lines += [f"% {note}" for note in table.notes]
     return "\n".join(lines) + "\n"
 
 

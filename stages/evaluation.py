@@ -10,29 +10,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-import torch
-
 from stages.artifacts import EnvironmentLight, ExportedAsset
 from stages.base import Context, Stage
 from stages.errors import InputError
 from stages.prefilter_cache import cached_operator
 from stages.settings.evaluation import EvaluationConfig
-from svim3d.io.exr import read_rgb
+from stages.truth import MESH, SEEN, lit_views
 from svim3d.io.glb import read_mesh
-from svim3d.io.orbit import read_orbit
 from svim3d.io.triangles import read_triangles
 from svim3d.render.asset_figures import (
     Figures,
-    LitViews,
     geometry_figures,
     light_figures,
     novel_view_figures,
     relight_figures,
 )
-from svim3d.shading.environment import physical_radiance
 
-SEEN, UNSEEN = "A", ("B", "C")  # the light of the given views, and those of relighting
-INDEX, MESH = "orbit.json", "mesh.ply"
+UNSEEN = ("B", "C")  # lights of relighting
 
 
 @dataclass(frozen=True)
@@ -75,7 +69,7 @@ def run(
     mesh = read_mesh(file)
     try:
         surface = read_triangles(truth / MESH)
-        lit = {name: _lit_views(truth, name) for name in (SEEN, *UNSEEN)}
+        lit = {name: lit_views(truth, name)[0] for name in (SEEN, *UNSEEN)}
     except ValueError as error:
         raise InputError(str(error)) from error
     figures = geometry_figures(
@@ -93,22 +87,6 @@ def run(
     if env_preopt is not None:
         figures |= light_figures(env_preopt.latlong(), lit[SEEN].light)
     return AssetScores(figures)
-
-
-def _lit_views(truth: Path, environment: str) -> LitViews:
-    """The test views under one environment, and the map that lit them."""
-    cameras, images, _ = read_orbit(truth, f"test_{environment}")
-    index = json.loads((truth / INDEX).read_text())
-    try:
-        file = truth / index["environments"][environment]["file"]
-    except (KeyError, TypeError) as error:
-        raise ValueError(
-            f"wanted environments.{environment}.file in {truth / INDEX}, got "
-            f"{index.get('environments')}"
-        ) from error
-    if not file.is_file():
-        raise ValueError(f"wanted the light of {truth / INDEX}, but {file} does not exist")
-    return LitViews(cameras, images, physical_radiance(torch.from_numpy(read_rgb(file)))[0])
 
 
 EVALUATION = Stage(run)

@@ -47,25 +47,41 @@ def read_truth(folder: Path) -> Truth:
     Raises:
         ValueError: it lacks an index, or what the index names.
     """
-    file = folder / INDEX
-    if not file.is_file():
-        raise ValueError(f"wanted the truth of an object, but {folder} holds no {INDEX}")
-    index = json.loads(file.read_text())
+    index = _read_index(folder)
     given = None
     if index.get("train"):
         given = read_orbit(folder, wanted=_channels(folder / index["train"][0]["file"]))
     tests = index.get("test", [])
     lights = sorted({name for frame in tests for name in frame.get("files", {})})
     views = {name: _test_views(folder, index, name) for name in lights}
-    reference = index.get("reference")
-    is_told = isinstance(reference, dict)
+    reference = index.get("reference")  # an index of a view, or what is known of the photo
+    photo = reference if isinstance(reference, dict) else {}
     return Truth(
         surface=read_triangles(folder / MESH) if (folder / MESH).is_file() else None,
         given=given,
         novel=views.get(SEEN),
         relit={n: _lit(folder, index, n, *views[n]) for n in lights if n != SEEN},
-        exposure=float(reference.get("exposure", 1.0)) if is_told else 1.0,
+        exposure=float(photo.get("exposure", 1.0)),
     )
+
+
+def lit_views(folder: Path, light: str) -> list[LitViews]:
+    """Test views under one light, with their images' full set and the light itself.
+
+    Raises:
+        ValueError: there are none, or files are missing.
+    """
+    index = _read_index(folder)
+    cameras, images, _ = read_orbit(folder, f"test_{light}")
+    return _lit(folder, index, light, cameras, images)
+
+
+def _read_index(folder: Path) -> dict[str, Any]:
+    file = folder / INDEX
+    if not file.is_file():
+        raise ValueError(f"wanted the truth of an object, but {folder} holds no {INDEX}")
+    index: dict[str, Any] = json.loads(file.read_text())
+    return index
 
 
 def _channels(file: Path) -> tuple[str, ...]:

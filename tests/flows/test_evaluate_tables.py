@@ -157,6 +157,7 @@ def test_latex_is_escaped_and_complete(written):
         == len(tables_of(RESULTS, {}))
     )
     assert "asset, 0 deg & " in text
+    assert "% A note." in text
     body = [x for x in text.splitlines() if "&" in x]
     assert all(x.endswith("\\\\") for x in body)
     # Whatever starts a comment would hide the rest of its line.
