@@ -25,6 +25,7 @@ from flows.operator_options import (
     store_options,
 )
 from flows.options import edit_options, job_options, relight_options
+from flows.report_options import report_options, view_options
 from flows.serve_options import serve_options
 from flows.stability_options import stability_options
 from flows.train_options import train_options
@@ -47,6 +48,8 @@ DOERS = {
     "logs": "flows.runs",
     "store": "flows.store",
     "stability": "flows.stability",
+    "report": "flows.report.command",
+    "view": "flows.view",
 }
 
 # Thread pools that spin while they wait starve each other: two of them on two cores made the
@@ -136,6 +139,8 @@ def _parser() -> argparse.ArgumentParser:
             "carry out again what did not come to its end",
         ),
         ("logs", [logs_options(), shared], "print what the stages of a run said"),
+        ("report", [report_options(), shared], "write the page of a run again"),
+        ("view", [view_options(), shared], "look at an asset, or at a run while it goes on"),
         ("store", [store_options(shared)], "look at the artifacts, clean up, move them"),
         (
             "serve",

@@ -1,6 +1,6 @@
 """Gallery: all that the report of a run shows and that takes computing.
 
-Reads the views and, where there is one, the exported asset. Writes a sheet of all views for each
+Reads the photo and what was cut out of it, the views and the exported asset, each where there is one. Writes a sheet of all views for each
 kind of picture, the same sheets of the asset seen by the same cameras, a picture that stands for
 the asset where nothing can be drawn live, lights to turn it in, and, where the asset is too large
 for a page, a copy with smaller textures. The asset goes through its file, as in the preview stage.
@@ -8,6 +8,7 @@ for a page, a copy with smaller textures. The asset goes through its file, as in
 
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,6 +18,7 @@ from torch.nn.functional import interpolate
 
 from stages.artifacts import ExportedAsset, FinishedFiles, MaterialViews
 from stages.base import Context, Stage
+from stages.photo_artifact import PreparedPhoto
 from stages.prefilter_cache import cached_operator
 from stages.settings.gallery import GalleryConfig
 from svim3d.cameras import Cameras
@@ -26,6 +28,7 @@ from svim3d.io.glb import read_mesh
 from svim3d.io.gltf_shrink import shrink_glb
 from svim3d.io.hdr import write_hdr
 from svim3d.io.image import PAPER
+from svim3d.io.photo import read_photo
 from svim3d.io.thumbnail import encode_webp
 from svim3d.mesh.source_mesh import SourceMesh
 from svim3d.render.deferred import Shader, environment_shader
@@ -41,7 +44,8 @@ FOUND = "found"  # the light that was fitted with the asset
 LIGHTS = {"studio": studio_radiance, "noon": noon, "overcast": overcast, "night": night}
 LIGHT_ROWS = 64  # of the lat-long pictures: a texel is 3 degrees, half the smallest lamp
 LIGHT_SIZE = 64  # of the octahedral map that the asset is rendered in
-COLUMNS = 7  # of a sheet
+CELL, COLUMNS = 192, 7  # side of each picture on a sheet, pixels, and pictures in a row
+PHOTO_PX = 640  # longest side of the input
 POSTER_PX = 480
 # The asset is rendered at so many times the size it is shown in, and averaged down: half the time
 # of four samples a pixel, and outlines are as smooth to the eye.
@@ -62,31 +66,47 @@ class Gallery(FinishedFiles):
 
 
 def run(
-    views: MaterialViews,
+    source: Path | None = None,
+    photo: PreparedPhoto | None = None,
+    views: MaterialViews | None = None,
     asset: ExportedAsset | None = None,
     *,
     config: GalleryConfig,
     ctx: Context,
 ) -> Gallery:
-    """Draw everything once."""
-    order = _order(views)
-    files = _sheets("views", _shown(views), views.cameras, order, config.cell)
-    about: dict[str, Any] = {
-        "cell": config.cell,
-        "columns": COLUMNS,
-        "views": [_angles(views.cameras, view) | {"view": view} for view in order],
-        "camera": _angles(views.cameras, views.reference),
-    }
+    """Draw what there is: the photo, its cut-out, the views, the asset as they see it."""
+    files: dict[str, bytes] = {}
+    about: dict[str, Any] = {"cell": CELL, "columns": COLUMNS, "views": [], "light": []}
+    if source is not None:
+        given = read_photo(source, ctx.event, longest_px=PHOTO_PX)
+        files["input.webp"] = _on_paper(given.rgb, given.mask)
+    if photo is not None:
+        files["cut_out.webp"] = _on_paper(photo.rgb, photo.mask)
+    if views is not None:
+        order = _order(views)
+        files |= _sheets("views", _shown(views), views.cameras, order)
+        about["views"] = [_angles(views.cameras, view) | {"view": view} for view in order]
     if asset is not None:
         light = _found_light(asset, ctx)
-        found, rendered = _of_asset(asset, light, views.cameras, views.reference, config, ctx)
-        files |= _sheets("asset", rendered, views.cameras, order, config.cell) | found
-        files |= _lights(light, ctx)
-        about["light"] = [FOUND, *LIGHTS] if light is not None else list(LIGHTS)
-        files |= _model(asset, config, ctx)
+        about["light"] = [*([] if light is None else [FOUND]), *LIGHTS]
+        files |= _lights(light, ctx) | _model(asset, config, ctx)
+        if views is not None:
+            files |= _of_asset(asset, light, views, order, ctx)
     files[ABOUT] = json.dumps(about, indent=1).encode()
     sheets = sum(name.startswith(("views/", "asset/")) for name in files)
-    return Gallery(files, {"views": len(order), "sheets": sheets})
+    return Gallery(files, {"views": len(about["views"]), "sheets": sheets})
+
+
+def _on_paper(rgb: Float[Tensor, "H W 3"], mask: Float[Tensor, "H W 1"] | None) -> bytes:
+    """A photo, small; what is transparent shows the paper of all our sheets."""
+    laid = rgb if mask is None else PAPER + mask * (rgb - PAPER)
+    factor = PHOTO_PX / max(laid.shape[:2])
+    if factor < 1.0:
+        size = [max(1, round(side * factor)) for side in laid.shape[:2]]
+        planes = laid.permute(2, 0, 1)[None]
+        smaller = interpolate(planes, size=size, mode="bilinear", antialias=True)
+        laid = smaller[0].permute(1, 2, 0)
+    return encode_webp(laid)
 
 
 def _order(views: MaterialViews) -> list[int]:
@@ -122,7 +142,7 @@ def _shown(views: MaterialViews) -> Images:
 
 
 def _sheets(
-    kind: str, images: Images, cameras: Cameras, order: list[int], cell: int
+    kind: str, images: Images, cameras: Cameras, order: list[int]
 ) -> dict[str, bytes]:
     """A sheet for each kind of picture; normals are shown as the camera's."""
     mask = images["mask"]
@@ -134,26 +154,26 @@ def _sheets(
         "metallic": images["metallic"],
         "normal": turned * 0.5 + 0.5,
     }
-    sheets = {name: _sheet(picture, mask, order, cell) for name, picture in pictures.items()}
-    sheets["mask"] = _sheet(mask, torch.ones_like(mask), order, cell)
+    sheets = {name: _sheet(picture, mask, order) for name, picture in pictures.items()}
+    sheets["mask"] = _sheet(mask, torch.ones_like(mask), order)
     if "confidence" in images:
         trust = images["confidence"]
-        sheets["confidence"] = _sheet(trust / trust.max().clamp_min(1e-6), mask, order, cell)
+        sheets["confidence"] = _sheet(trust / trust.max().clamp_min(1e-6), mask, order)
     return {f"{kind}/{name}.webp": encode_webp(sheet) for name, sheet in sheets.items()}
 
 
 def _sheet(
-    pictures: Float[Tensor, "V H W C"], mask: Float[Tensor, "V H W 1"], order: list[int], cell: int
+    pictures: Float[Tensor, "V H W C"], mask: Float[Tensor, "V H W 1"], order: list[int]
 ) -> Float[Tensor, "_ _ 3"]:
     """All views on paper, in rows of `COLUMNS` cells."""
     colour = pictures[order].clamp(0.0, 1.0)
     laid = PAPER + mask[order].clamp(0.0, 1.0) * (colour - PAPER)
     planes = laid.expand(*laid.shape[:-1], 3).permute(0, 3, 1, 2)
-    cells = interpolate(planes, size=(cell, cell), mode="bilinear", antialias=True)
+    cells = interpolate(planes, size=(CELL, CELL), mode="bilinear", antialias=True)
     rows = -(-len(order) // COLUMNS)
-    blank = cells.new_full((rows * COLUMNS - len(order), 3, cell, cell), PAPER)
-    grid = torch.cat([cells, blank]).view(rows, COLUMNS, 3, cell, cell)
-    return grid.permute(0, 3, 1, 4, 2).reshape(rows * cell, COLUMNS * cell, 3)
+    blank = cells.new_full((rows * COLUMNS - len(order), 3, CELL, CELL), PAPER)
+    grid = torch.cat([cells, blank]).view(rows, COLUMNS, 3, CELL, CELL)
+    return grid.permute(0, 3, 1, 4, 2).reshape(rows * CELL, COLUMNS * CELL, 3)
 
 
 def _found_light(asset: ExportedAsset, ctx: Context) -> Float[Tensor, "H W 3"] | None:
@@ -168,27 +188,27 @@ def _found_light(asset: ExportedAsset, ctx: Context) -> Float[Tensor, "H W 3"] |
 def _of_asset(
     asset: ExportedAsset,
     light: Float[Tensor, "H W 3"] | None,
-    cameras: Cameras,
-    reference: int,
-    config: GalleryConfig,
+    views: MaterialViews,
+    order: list[int],
     ctx: Context,
-) -> tuple[dict[str, bytes], Images]:
-    """The poster, and the asset as the views' cameras see it, under the light it came with."""
+) -> dict[str, bytes]:
+    """The asset as the views' cameras see it, under the light it came with, and the poster."""
     latlong = _latlong(LIGHTS["studio"]) if light is None else light
     radiance = octahedral_from_latlong(latlong, LIGHT_SIZE)
     shader = environment_shader(cached_operator(ctx.shared, LIGHT_SIZE)(radiance))
     file = ctx.work / ASSET
     file.write_bytes(asset.files[ASSET])
     mesh = read_mesh(file)
-    side = round(RENDERED * config.cell)
-    small = cameras.resized(side, side)
+    side = round(RENDERED * CELL)
+    cameras = views.cameras.resized(side, side)
     rendered: list[Images] = []
     for view in range(len(cameras)):
-        rendered.append(render_pictures(mesh, small[view], shader, supersample=1))
+        rendered.append(render_pictures(mesh, cameras[view], shader, supersample=1))
         ctx.report(view + 1, len(cameras), {"coverage": float(rendered[-1]["mask"].mean())})
-    poster = _poster(mesh, cameras[reference], shader)
     names = ("radiance", "mask", "basecolor", "roughness", "metallic", "normal_world")
-    return {POSTER: poster}, {name: torch.cat([r[name] for r in rendered]) for name in names}
+    images = {name: torch.cat([seen[name] for seen in rendered]) for name in names}
+    poster = _poster(mesh, views.cameras[views.reference], shader)
+    return {POSTER: poster, **_sheets("asset", images, views.cameras, order)}
 
 
 def _poster(mesh: SourceMesh, camera: Cameras, shader: Shader) -> bytes:

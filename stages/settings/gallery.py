@@ -8,8 +8,5 @@ from stages.settings.base import StageConfig
 class GalleryConfig(StageConfig):
     """What the report of a run shows."""
 
-    cell: int = Field(default=192, ge=64, le=512)
-    """Side of each view's picture, pixels."""
-
     most_model_mib: float = Field(default=8.0, ge=0.1, le=64.0)
     """Of the asset inside the page; larger ones get smaller textures there."""
