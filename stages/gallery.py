@@ -141,9 +141,7 @@ def _shown(views: MaterialViews) -> Images:
     return planes if views.confidence is None else planes | {"confidence": views.confidence}
 
 
-def _sheets(
-    kind: str, images: Images, cameras: Cameras, order: list[int]
-) -> dict[str, bytes]:
+def _sheets(kind: str, images: Images, cameras: Cameras, order: list[int]) -> dict[str, bytes]:
     """A sheet for each kind of picture; normals are shown as the camera's."""
     mask = images["mask"]
     turned = torch.einsum("vij,vhwi->vhwj", cameras.c2w[:, :3, :3], images["normal_world"])

@@ -150,7 +150,9 @@ ADVICE: Mapping[str, Advice] = {
         "Pixels without a number were filled from their neighbours",
         "Find out who wrote them if there are many.",
     ),
-    "clamped": _mended("Values out of range were clamped", "Check how these channels were written."),
+    "clamped": _mended(
+        "Values out of range were clamped", "Check how these channels were written."
+    ),
     "depth_dropped": _mended("Depths without a meaning were dropped", "Nothing to do."),
     "normals_rescaled": _mended("Normals were brought to unit length", "Nothing to do."),
     "view_dropped": _mended("A view shows nothing and was left out", "Check its mask."),

@@ -5,7 +5,7 @@ import json
 import math
 import shlex
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from flows.report.charts import sparkline
 from flows.report.evidence import RunEvidence, StageEvidence
-from flows.report.notes import WITHOUT, grouped, remedy
+from flows.report.notes import CAPACITY, WITHOUT, grouped, remedy
 from flows.report.pictures import Pictures
 from flows.report.template import TEMPLATES, filled
 from flows.run_records import CACHED, COMPUTED, DIED, DONE, FAILED
@@ -25,9 +25,10 @@ MODEL, POSTER, ASSET = "model.glb", "poster.webp", "asset.glb"
 SUMMARY, METRICS, PLAN = "summary.json", "metrics.json", "capacity.json"
 CHANNELS = ("rgb", "basecolor", "roughness", "metallic", "normal", "mask", "confidence")
 LABELS = {"rgb": "RGB"}
-LIGHT_LABELS = {"found": "as found", "noon": "noon", "overcast": "overcast", "night": "night"}
-LIGHT_LABELS["studio"] = "studio"
+LIGHT_LABELS = {"found": "as found"}
 MOST_CURVES = 18  # of a stage
+NOT_FITTED = ("generation",)  # what it counts on its way is no loss
+LEAST_TOLD_S = 0.1
 MOST_INPUT_BYTES = 1 << 20  # of a photo that goes into the page as it is
 MIME = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
 FIGURES = {
@@ -46,8 +47,6 @@ def run_page(evidence: RunEvidence, pictures: Pictures) -> str:
     state = record.now
     model, model_note = _model(evidence, pictures)
     channels = _channels(pictures)
-    events = [(s.name, kind, message) for s in evidence.stages for kind, message in s.events]
-    events += [("report", kind, message) for kind, message in pictures.events]
     values: dict[str, Any] = {
         "title": f"{record.asset}: report",
         "run": {
@@ -61,14 +60,18 @@ def run_page(evidence: RunEvidence, pictures: Pictures) -> str:
             "log": evidence.log,
         },
         "facts": _facts(evidence),
-        "notes": list(grouped(events).items()),
+        "notes": list(grouped(_events(evidence, pictures)).items()),
         "skipped": _left_out(evidence),
         "inputs": _inputs(evidence, pictures),
         "channels": channels,
         "has_asset": any(channel["asset"] for channel in channels),
         "views": pictures.about.get("views", []),
         "figures": _figures(evidence),
-        "losses": [found for stage in evidence.stages if (found := _losses(stage))],
+        "losses": [
+            found
+            for stage in evidence.stages
+            if stage.name not in NOT_FITTED and (found := _losses(stage))
+        ],
         "stages": _stages(evidence.stages),
         "cost_note": _cost_note(evidence, pictures),
         "capacity": _capacity(evidence),
@@ -256,6 +259,16 @@ def _about(pictures: Pictures) -> Markup:
 # What went in.
 
 
+def _events(evidence: RunEvidence, pictures: Pictures) -> Iterator[tuple[str, str, str]]:
+    """Stage, kind and message of what is said nowhere else on the page."""
+    has_sizes = bool(_json(evidence, "capacity", PLAN))
+    for stage in evidence.stages:
+        for kind, message in stage.events:
+            if message != evidence.record.error and not (has_sizes and kind == CAPACITY):
+                yield stage.name, kind, message
+    yield from (("report", kind, message) for kind, message in pictures.events)
+
+
 def _left_out(evidence: RunEvidence) -> list[tuple[str, str]]:
     """Stages without an artifact, and what that means for the asset."""
     return [
@@ -320,7 +333,7 @@ def _stages(stages: Sequence[StageEvidence]) -> list[dict[str, Any]]:
         {
             "name": s.name,
             "state": "was at work" if s.state == "computing" else s.state,
-            "away": not s.stored,
+            "away": not s.stored and s.state != FAILED,
             "bad": s.state == FAILED,
             "cached": s.state == CACHED,
             "share": None if s.seconds is None else round(100 * s.seconds / (longest or 1.0), 1),
@@ -341,8 +354,9 @@ def _cost_note(evidence: RunEvidence, pictures: Pictures) -> str:
     computed = [s.seconds for s in evidence.stages if s.state == COMPUTED and s.seconds]
     if computed:
         parts.append(f"{sum(computed):.1f} s went into stages in this run.")
-    if "engine_startup_s" in evidence.about:
-        parts.append(f"{evidence.about['engine_startup_s']:.1f} s were spent on the engine.")
+    waited_s = evidence.about.get("engine_startup_s", 0.0)
+    if waited_s >= LEAST_TOLD_S:
+        parts.append(f"{waited_s:.1f} s were spent on the engine's start.")
     if pictures.cpu_seconds:
         parts.append(f"The pictures of this page took {pictures.cpu_seconds:.1f} CPU seconds.")
     return " ".join(parts)
@@ -357,8 +371,10 @@ def _capacity(evidence: RunEvidence) -> list[dict[str, Any]]:
         bound = configs.get(stage, {}).get(name, "")
         if isinstance(bound, list) and bound:
             bound = bound[-1]
-        value = f"{choice['value']:g}"
-        rows.append(choice | {"value": value, "bound": bound})
+        enough = choice["value"]
+        used = min(enough, bound) if isinstance(bound, int | float) else enough
+        said = {"value": f"{enough:g}", "bound": bound, "used": f"{used:g}"}
+        rows.append(choice | said)
     return rows
 
 

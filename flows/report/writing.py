@@ -14,6 +14,7 @@ from stages.store import Store
 
 log = logging.getLogger(__name__)
 
+
 def write_report(
     record: RunRecord, store: Store, file: Path, config: GalleryConfig | None = None
 ) -> None:
