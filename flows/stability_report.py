@@ -148,10 +148,8 @@ def _row(row: Row) -> list[Cell]:
     ]
 
 
-def _chart(title: str, rows: Sequence[Row]) -> Any:
+def _chart(title: str, rows: Sequence[Row]) -> str:
     """Median score over severity, a line for each way; nothing where there is no course."""
-    from markupsafe import Markup
-
     severities = sorted({row.severity for row in rows})
     lines = []
     for way in dict.fromkeys(row.way for row in rows):
@@ -162,7 +160,7 @@ def _chart(title: str, rows: Sequence[Row]) -> Any:
     if len(severities) < 2 or not lines:
         return ""
     about = f"Median score over severity: {title}"
-    return Markup(line_chart(about, lines, unit="dB", ticks=severities))
+    return line_chart(about, lines, unit="dB", ticks=severities)
 
 
 def _cases(rows: Sequence[Row]) -> Iterator[dict[str, str]]:

@@ -1,9 +1,10 @@
 """Gallery: all that the report of a run shows and that takes computing.
 
-Reads the photo and what was cut out of it, the views and the exported asset, each where there is one. Writes a sheet of all views for each
-kind of picture, the same sheets of the asset seen by the same cameras, a picture that stands for
-the asset where nothing can be drawn live, lights to turn it in, and, where the asset is too large
-for a page, a copy with smaller textures. The asset goes through its file, as in the preview stage.
+Reads the photo and what was cut out of it, the views and the exported asset, each where there is
+one. Writes a sheet of all views for each kind of picture, the same sheets of the asset seen by the
+same cameras, a picture that stands for the asset where nothing can be drawn live, lights to turn it
+in, and, where the asset is too large for a page, a copy with smaller textures. The asset goes
+through its file, as in the preview stage.
 """
 
 import json
@@ -78,7 +79,7 @@ def run(
     files: dict[str, bytes] = {}
     about: dict[str, Any] = {"cell": CELL, "columns": COLUMNS, "views": [], "light": []}
     if source is not None:
-        given = read_photo(source, ctx.event, longest_px=PHOTO_PX)
+        given = read_photo(source, ctx.event, longest_px=2 * PHOTO_PX)
         files["input.webp"] = _on_paper(given.rgb, given.mask)
     if photo is not None:
         files["cut_out.webp"] = _on_paper(photo.rgb, photo.mask)

@@ -156,6 +156,13 @@ ADVICE: Mapping[str, Advice] = {
     "depth_dropped": _mended("Depths without a meaning were dropped", "Nothing to do."),
     "normals_rescaled": _mended("Normals were brought to unit length", "Nothing to do."),
     "view_dropped": _mended("A view shows nothing and was left out", "Check its mask."),
+    "camera_assumed": _mended(
+        "A frame's camera is not known", "Keep the orbit's orbit.json beside the frame."
+    ),
+    "clipped": _mended(
+        "Values too large for the file were cut off", "Check what is that bright; scale it down."
+    ),
+    "edit": _chosen("Materials were changed as asked", "See edits.json."),
     "no_depth": _mended("The views carry no depth", "Nothing casts a shadow."),
     # Lights.
     "light_mended": _mended("The light held values that are none", "Check the file."),
@@ -197,7 +204,8 @@ ADVICE: Mapping[str, Advice] = {
     ),
     "lod": _chosen("Coarser levels were written", "They lie beside the asset in export/files."),
     "no_lpips": _mended(
-        "Pictures were compared by structure, for want of LPIPS weights", "Give nerf.lpips_weights."
+        "Pictures were compared by structure, for want of LPIPS weights",
+        "Give nerf.perceptual_weights.",
     ),
     "model_reduced": _chosen(
         "This page turns a smaller copy of the asset", "asset.glb beside it is the whole one."
@@ -241,8 +249,8 @@ WITHOUT = {
 FAULTS = {
     "InputError": "The input cannot be used as it is. The message says what was wanted, what came "
     "and what to do; mend that and give the command again.",
-    "DivergenceError": "The fit went astray. Lower the learning rate that the message names, or try "
-    "another --seed; check the views below for NaN, wrong masks or cameras first.",
+    "DivergenceError": "The fit went astray. Lower the learning rate that the message names, or "
+    "try another --seed; check the views below for NaN, wrong masks or cameras first.",
     "FullError": "The disk is full. Free some space (svim3d store gc helps), then resume.",
     "TransientError": "Something the run needs was away for a while. Resume when it is back.",
     "OutOfMemoryError": "Memory ran out in spite of smaller pieces. Use a smaller preset, or a "
@@ -252,8 +260,8 @@ FAULTS = {
     "StageTimeoutError": "A stage ran into its --timeout. Resume goes on from its last checkpoint.",
 }
 OTHER_FAULT = (
-    "This is no fault of your input that we know of. Resume once: finished stages stay. If it fails "
-    "again, run the command with --debug and report what it prints."
+    "This is no fault of your input that we know of. Resume once: finished stages stay. If it "
+    "fails again, run the command with --debug and report what it prints."
 )
 
 

@@ -23,5 +23,5 @@ def _environment() -> jinja2.Environment:
 
 def filled(name: str, **values: Any) -> str:
     """A page made of a template, with the style sheet of all of them."""
-    style = jinja2.utils.markupsafe.Markup((TEMPLATES / "style.css").read_text())
+    style = (TEMPLATES / "style.css").read_text()
     return _environment().get_template(name).render(style=style, **values)
