@@ -92,6 +92,11 @@ class Pipeline:
         return tuple(node.name for node in self.nodes)
 
     @property
+    def results(self) -> tuple[Product, ...]:
+        """Products that stages make, the best first."""
+        return tuple(product for product in self.products if product.origins)
+
+    @property
     def has_report(self) -> bool:
         """Whether a page tells of each run."""
         return any(product.name == REPORT for product in self.products)
