@@ -6,6 +6,7 @@ the asset. Files are looked at, nothing is computed but what showing them takes.
 
 import argparse
 import contextlib
+import functools
 import importlib.util
 import time
 from collections.abc import Callable
@@ -74,7 +75,8 @@ def start_server(host: str, port: int) -> "viser.ViserServer":
     server.scene.set_up_direction("+y")
     server.initial_camera.position = (1.4, 1.1, 2.9)  # outside the orbit of the views
     server.initial_camera.look_at = (0.0, 0.0, 0.0)
-    server.scene.configure_environment_map("studio")  # one that the viewer brings along
+    # One that the viewer brings along, dimmed: it shines beside the viewer's own lamps.
+    server.scene.configure_environment_map("studio", environment_intensity=0.5)
     return server
 
 
@@ -116,7 +118,8 @@ class LiveScene:
         with contextlib.suppress(OSError):  # being written at this moment
             version = file.stat().st_mtime_ns
             if self._is_new("export", version):
-                self._put("export", [self._glb(file.read_bytes())])
+                content = file.read_bytes()
+                self._put("export", lambda: [self._glb(content)])
                 self._say(f"**{file.name}**, {file.stat().st_size / 2**20:.2f} MiB")
 
     def show_run(self, record: RunRecord, store: Store) -> None:
@@ -135,7 +138,7 @@ class LiveScene:
             key = noted.key if noted else None
             payload = store.artifact(key) / FILES_FOLDER if key else None
             if payload is not None and payload.is_dir() and self._is_new(stage, key):
-                self._put(stage, show(payload))
+                self._put(stage, functools.partial(show, payload))
 
     def _is_new(self, name: str, version: object) -> bool:
         return self._versions.get(name) != version and not self._versions.update({name: version})
@@ -144,11 +147,11 @@ class LiveScene:
         if text != self._said:
             self._status.content = self._said = text
 
-    def _put(self, name: str, handles: list[Any]) -> None:
+    def _put(self, name: str, show: Callable[[], list[Any]]) -> None:
         """Take the place of an earlier version, and of what was in front so far."""
-        for handle in self._handles.get(name, ()):
+        for handle in self._handles.pop(name, ()):
             handle.remove()
-        self._handles[name] = handles
+        self._handles[name] = show()
         if name not in self._boxes:
             box = self._server.gui.add_checkbox(LAYERS.get(name, CAMERAS), initial_value=True)
             box.on_update(lambda _: self._obey())
