@@ -88,6 +88,8 @@ def halves(picture):
 def test_the_asset_is_drawn_and_its_sides_are_where_they_were(page):
     picture = eventually(page, lambda picture: picture[..., 3].max() == 1.0)
     left, right = halves(picture)
+    radius = page.evaluate("document.querySelector('model-viewer').getCameraOrbit().radius")
+    assert math.isclose(radius, 2.2, abs_tol=1e-3)  # the views' own
     assert left[0] > 2.0 * left[1]  # red plastic
     assert right[1] > 0.5 * right[0] > 0.1  # gold
 

@@ -172,13 +172,15 @@ def test_a_report_without_pictures_is_better_than_none(tmp_path, monkeypatch, ca
     assert "basecolor 19.5 dB" in checked((made.folder / REPORT).read_text())
 
 
-def test_the_command_writes_it_again(done, tmp_path, capsys):
+def test_the_command_writes_it_again_and_status_names_it(done, tmp_path, capsys):
     made, record, _ = done
     file = tmp_path / "new" / "page.html"
     store = str(made.store.root)
     assert main(["report", record.id, "--store", store, "-o", str(file)]) == 0
     assert "page.html: 1." in capsys.readouterr().out  # the viewer is one MiB of it
     checked(file.read_text())
+    assert main(["status", record.id, "--store", store]) == 0
+    assert str(made.folder / REPORT) in capsys.readouterr().out
     assert main(["report", "nobody", "--store", store]) == 2
     assert main(["report", record.id, "--store", store, "--most-mib", "0"]) == 2
     assert "--most-mib 0.0: wanted 0.1 to 64" in capsys.readouterr().err
