@@ -22,7 +22,9 @@ const setLight = () => {
 const setExposure = () => {
   const stops = Number(field("exposure").value);
   viewer.exposure = 2 ** stops;
-  form.querySelector("output[for=exposure]").textContent = `${stops > 0 ? "+" : ""}${stops} stops`;
+  const text = `${stops > 0 ? "+" : ""}${stops} stops`;
+  form.querySelector("output[for=exposure]").textContent = text;
+  field("exposure").setAttribute("aria-valuetext", text);
 };
 
 // -1 takes a value to 0, 0 leaves it as it was found, 1 takes it to 1.
