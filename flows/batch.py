@@ -154,7 +154,7 @@ class _Run:
         self._tell(Row(job.name, self._sources[job.name], State.FAILED, *told), style="red")
 
     def _done(self, job: BatchJob, state: State, seconds: float) -> None:
-        products = (job.out / product.name for product in job.pipeline.products)
+        products = (job.out / product.name for product in job.pipeline.results)
         asset = next((str(product) for product in products if product.exists()), "")
         source = self._sources[job.name]
         row = Row(job.name, source, state, round(seconds, 3), asset=asset)

@@ -98,7 +98,7 @@ class BatchJob:
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return False
         wanted = {s.node.name: s.recipe.key if s.recipe else None for s in plan.steps}
-        has_product = any((self.out / product.name).exists() for product in plan.pipeline.products)
+        has_product = any((self.out / product.name).exists() for product in plan.pipeline.results)
         return shown == wanted and has_product
 
     def finish(self, plan: Plan, artifacts: Mapping[str, Stored], store: Store) -> None:

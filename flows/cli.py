@@ -31,6 +31,7 @@ from flows.options import (
     relight_options,
     shared_options,
 )
+from flows.report_options import report_options, view_options
 from flows.serve_options import serve_options
 from flows.stability_options import stability_options
 from flows.train_options import train_options
@@ -54,6 +55,8 @@ DOERS = {
     "store": "flows.store",
     "stability": "flows.stability",
     "evaluate": "flows.evaluate",
+    "report": "flows.report.command",
+    "view": "flows.view",
 }
 
 # Thread pools that spin while they wait starve each other: two of them on two cores made the
@@ -135,6 +138,8 @@ def _parser() -> argparse.ArgumentParser:
             "carry out again what did not come to its end",
         ),
         ("logs", [logs_options(), shared], "print what the stages of a run said"),
+        ("report", [report_options(), shared], "write the page of a run again"),
+        ("view", [view_options(), shared], "look at an asset, or at a run while it goes on"),
         ("store", [store_options(shared)], "look at the artifacts, clean up, move them"),
         (
             "serve",

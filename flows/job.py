@@ -9,6 +9,7 @@ from rich.console import Console
 
 from flows.console import RunDisplay, result_table, stage_warnings_on
 from flows.engine import Engine
+from flows.pipeline import REPORT
 from flows.plan import Plan, Verdict
 from flows.recording import Audience, RunRecorder
 from flows.run_folder import require_ours, write_run_folder
@@ -89,8 +90,12 @@ class Job:
             preset=str(about.get("preset", "")),
             command=self._command,
         )
-        with self._recorder:
-            return self._carry_out(plan, about, compute)
+        try:
+            with self._recorder:
+                return self._carry_out(plan, about, compute)
+        finally:
+            if plan.pipeline.has_report and (self.out / REPORT).is_file():
+                self.console.print(f"{self.out / REPORT}", highlight=False, soft_wrap=True)
 
     def _carry_out(self, plan: Plan, about: Mapping[str, Any], compute: Compute) -> int:
         if plan.to_compute:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 SOURCE = "source"  # the input from outside: a photo, an orbit folder, a mesh or a scene file
 PHOTOS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".gif")
+REPORT = "report.html"  # the product that tells of the run
 MESHES = (".glb", ".gltf", ".obj", ".json")  # scenes among them
 
 
@@ -61,7 +62,8 @@ class Product:
 
     Attributes:
         name: in the run folder.
-        origins: stage and file name in its payload, the best first.
+        origins: stage and file name in its payload, the best first; none for the report, which
+            is written of the run as a whole.
     """
 
     name: str
@@ -88,6 +90,16 @@ class Pipeline:
     def names(self) -> tuple[str, ...]:
         """Stage names in order."""
         return tuple(node.name for node in self.nodes)
+
+    @property
+    def results(self) -> tuple[Product, ...]:
+        """Products that stages make, the best first."""
+        return tuple(product for product in self.products if product.origins)
+
+    @property
+    def has_report(self) -> bool:
+        """Whether a page tells of each run."""
+        return any(product.name == REPORT for product in self.products)
 
     @property
     def skippable(self) -> tuple[str, ...]:
@@ -135,6 +147,7 @@ IMAGE_TO_ASSET = Pipeline(
         Product("preview.png", (("preview", "preview.png"),)),
         Product("views.png", (("generation", "views.png"),)),
         *(Product(name, (("export", name),)) for name in EXPORTED),
+        Product(REPORT, ()),
     ),
     takes=(*PHOTOS, *MESHES),
 )

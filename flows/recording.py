@@ -14,7 +14,7 @@ from flows.hooks import Hooks
 from flows.pace import Pace
 from flows.plan import Plan, Step, Verdict
 from flows.processes import Process
-from flows.run_folder import replace_file
+from flows.run_folder import LOG_COPY, RECORD_COPY, replace_file
 from flows.run_records import (
     CACHED,
     CANCELLED,
@@ -41,15 +41,13 @@ if TYPE_CHECKING:  # a run that computes nothing is recorded without torch
 
 log = logging.getLogger(__name__)
 
-# Names of the copies that the run folder gets.
-RECORD_COPY, LOG_COPY = "record.json", "run.log"
 WRITE_EVERY_S = 2.0  # while a stage counts its steps
 LOG_FORMAT = "%(asctime)s %(levelname)-7s %(stage)-10s %(message)s"
 LOG_TIME = "%Y-%m-%dT%H:%M:%S%z"
 
 
 class RunRecorder:
-    """Keeps a run's page and log up to date for the length of a `with` block.
+    """Keeps a run's page and log up to date for the length of a `with` block, then reports.
 
     The page names all keys before anything is computed, so that no cleaning takes them. Where the
     store cannot be written there is neither page nor log, and the run goes on.
@@ -144,6 +142,10 @@ class RunRecorder:
             log.error(line, exc_info=error)
         self._change(state=state, error=line, ended=time.time())
         log.info("%s after %.1f s", state, self.record.duration_s)
+        if self._plan.pipeline.has_report and state != CANCELLED:  # who stops a run waits for it
+            from flows.report.writing import report_quietly
+
+            report_quietly(self.record, self._store)
         try:
             self._hooks.announce(self.record)
         finally:

@@ -14,6 +14,8 @@ from stages.errors import InputError
 from stages.store import Store, Stored
 
 RUN_PAGE = "run.json"
+# Copies of what the store knows of a run; the folder of a run that failed has nothing else.
+RECORD_COPY, LOG_COPY = "record.json", "run.log"
 
 
 def write_run_folder(
@@ -63,7 +65,8 @@ def require_ours(out: Path, pipeline: Pipeline) -> None:
     """
     names = [*pipeline.names, *(product.name for product in pipeline.products)]
     others = [name for name in names if os.path.lexists(out / name)]
-    if others and not (out / RUN_PAGE).exists():
+    is_ours = any((out / mark).exists() for mark in (RUN_PAGE, RECORD_COPY))
+    if others and not is_ours:
         raise InputError(
             f"the folder {out} is no run folder, yet holds {', '.join(others)}, which this run "
             "would replace; choose another folder with -o"

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from flows.pipeline import REPORT
 from flows.run_records import (
     CACHED,
     CANCELLED,
@@ -99,6 +100,7 @@ def _show_table(
 def _tell(record: RunRecord, index: RunIndex, console: Console) -> None:
     """All that is known of a run."""
     state = record.now
+    page = Path(record.folder) / REPORT
     facts = {
         "run": record.id,
         "input": record.source,
@@ -112,6 +114,7 @@ def _tell(record: RunRecord, index: RunIndex, console: Console) -> None:
         "took": in_short(record.duration_s),
         "process": f"{record.process.pid} on {record.process.host}",
         "log": str(index.log(record.id)),
+        "report": str(page) if page.is_file() else "",
         "command": " ".join(record.command),
     }
     table = Table(box=None, pad_edge=False, show_header=False)

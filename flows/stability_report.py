@@ -1,10 +1,12 @@
 """The report of the stability suite: one HTML file that needs no other, and no script."""
 
-import html
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from flows.report.charts import Line, line_chart
 from flows.stability_cases import OURS
 from flows.stability_table import (
     FORBIDDEN,
@@ -16,33 +18,30 @@ from flows.stability_table import (
     confusion,
 )
 
-STYLE = """
-:root { color-scheme: light dark; --ink: #1c1f24; --paper: #fff; --line: #c9ced6; --soft: #f3f5f8;
-  --bad: #b3261e; --ours: #0b5cad; --plain: #a35200; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e7eaee; --paper: #15181c; --line: #444b55;
-  --soft: #1f242a; --bad: #ff8a80; --ours: #7db8ff; --plain: #ffb870; } }
-body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper);
-  max-width: 76rem; margin: 0 auto; padding: 1rem 1.5rem 4rem; }
-h2 { margin: 2.5rem 0 .2rem; border-top: 1px solid var(--line); padding-top: 1rem; }
-table { border-collapse: collapse; margin: .6rem 0; font-variant-numeric: tabular-nums; }
-caption { text-align: left; padding: .2rem 0; }
-th, td { padding: .15rem .6rem; border-bottom: 1px solid var(--line); text-align: right; }
-th:first-child, td:first-child, td.text, th.text { text-align: left; }
-thead th { background: var(--soft); }
-.bad { color: var(--bad); font-weight: 600; }
-.wide { overflow-x: auto; }
-figure { display: inline-block; margin: .4rem 1rem .4rem 0; vertical-align: top; }
-figcaption { font-size: 13px; max-width: 36rem; }
-img { display: block; max-width: 100%; }
-svg text { font-size: 11px; fill: var(--ink); }
-nav ul { columns: 4; padding-left: 1.2rem; }
-"""
 HEAD = (
     *("severity", "way", "cases", "failed", "95 %", "p5", "p50", "p95", "worst 10 %"),
     *("asset", "noted", "error", "forbidden"),
 )
-CHART = (300, 150, 34)  # width, height and margin, pixels
+TEXTS = ("severity", "way", "outcome", "was")  # columns that are read, not compared
 MOST_NOTES = 4  # different ones are shown of a severity
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table."""
+
+    text: str
+    is_bad: bool = False
+    is_text: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; the first cell of each row names it."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    caption: str = ""
 
 
 def write_page(
@@ -61,45 +60,37 @@ def write_page(
         told: lines on how all was measured.
         file: where to.
     """
-    hazards = list(dict.fromkeys(row.hazard for row in rows))
-    parts = [
-        "<!doctype html>",
-        '<html lang="en"><head><meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>Stability</title><style>{STYLE}</style></head><body><main>",
-        "<h1>Stability where methods fail</h1>",
-        *(f"<p>{html.escape(line)}</p>" for line in told),
-        _summary(judged),
-        _contents(hazards),
-        *(_section(name, rows, about[name]) for name in hazards),
-        "</main></body></html>",
-    ]
-    file.write_text("\n".join(part for part in parts if part))
+    from flows.report.template import filled  # only who writes a page loads it
+
+    names = list(dict.fromkeys(row.hazard for row in rows))
+    page = filled(
+        "stability.html.j2",
+        title="Stability",
+        told=told,
+        texts=TEXTS,
+        summary=_summary(judged),
+        wrong=list(_wrong(judged)),
+        hazards=[_hazard(name, rows, about[name]) for name in names],
+    )
+    file.write_text(page)
 
 
-def _summary(judged: Sequence[Judged]) -> str:
-    """How many cases came to what, by way; and those that must not be."""
+def _summary(judged: Sequence[Judged]) -> Table:
+    """How many cases came to what, by way."""
     ways = list(dict.fromkeys(one.case.way for one in judged))
-    body = []
+    rows = []
     for verdict in Verdict:
         counts = [sum(o.case.way == w and o.verdict is verdict for o in judged) for w in ways]
-        style = ' class="bad"' if verdict in FORBIDDEN and any(counts) else ""
-        numbers = "".join(f"<td{style}>{count}</td>" for count in counts)
-        body.append(f'<tr><th scope="row" class="text">{verdict}</th>{numbers}</tr>')
-    head = "".join(f'<th scope="col">{html.escape(way)}</th>' for way in ways)
-    table = (
-        "<table><caption>What the cases came to</caption><thead><tr><th scope='col' class='text'>"
-        f"outcome</th>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
-    )
-    wrong = [one for one in judged if one.verdict in FORBIDDEN and one.case.way == OURS]
-    if not wrong:
-        return table
-    listed = "".join(
-        f'<li class="bad">{html.escape(one.case.name)}: {one.verdict}'
-        f"{html.escape(_reason(one))}</li>"
-        for one in wrong
-    )
-    return f"{table}<p>Must not be:</p><ul>{listed}</ul>"
+        is_bad = verdict in FORBIDDEN and any(counts)
+        rows.append([Cell(str(verdict)), *(Cell(str(count), is_bad) for count in counts)])
+    return Table(("outcome", *ways), rows)
+
+
+def _wrong(judged: Sequence[Judged]) -> Iterator[str]:
+    """Cases that must not be."""
+    for one in judged:
+        if one.verdict in FORBIDDEN and one.case.way == OURS:
+            yield f"{one.case.name}: {one.verdict}{_reason(one)}"
 
 
 def _reason(one: Judged) -> str:
@@ -108,138 +99,94 @@ def _reason(one: Judged) -> str:
     return f", {one.lost_db:.1f} dB lost" if math.isfinite(one.lost_db) else ""
 
 
-def _contents(hazards: Iterable[str]) -> str:
-    items = "".join(f'<li><a href="#{name}">{name}</a></li>' for name in hazards)
-    return f'<nav aria-label="Hazards"><ul>{items}</ul></nav>'
-
-
-def _section(name: str, rows: Sequence[Row], about: tuple[str, str]) -> str:
+def _hazard(name: str, rows: Sequence[Row], about: tuple[str, str]) -> dict[str, Any]:
     """A hazard: its tables, curves and pictures."""
     own = [row for row in rows if row.hazard == name]
     breaks = breakdowns(own)
-    parts = [
-        f'<section id="{name}"><h2>{name}</h2>',
-        f"<p>{html.escape(about[0])} (severity: {html.escape(about[1])}).</p>",
-    ]
+    variants = []
     for variant in dict.fromkeys(row.variant for row in own):
         chosen = [row for row in own if row.variant == variant]
-        parts.append(_table(variant or name, chosen, breaks))
-        if len({row.severity for row in chosen}) > 1 and any(row.scores for row in chosen):
-            parts.append(_chart(variant or name, chosen))
-        parts.append(_pictures(chosen))
-    if name == "gloss-or-metal":
-        parts.append(_confusion([one for row in own for one in row.cases]))
-    return "\n".join([*parts, "</section>"])
-
-
-def _table(title: str, rows: Sequence[Row], breaks: Mapping[tuple[str, str, str], object]) -> str:
-    """All severities, one way after the other."""
-    body = []
-    for row in rows:
-        page = cells(row, None)
-        bad = ' class="bad"' if page["forbidden"] else ""
-        body.append(
-            f'<tr><th scope="row">{row.severity:g}</th><td class="text">{row.way}</td>'
-            f"<td>{page['cases']}</td><td>{page['rate']:.0%}</td>"
-            f"<td>{page['low']:.0%} to {page['high']:.0%}</td>"
-            + "".join(
-                f"<td>{_decibels(page[c])}</td>"
-                for c in ("p5_db", "p50_db", "p95_db", "worst_tenth_db")
-            )
-            + f"<td>{page['assets']}</td><td>{page['noted']}</td><td>{page['refused']}</td>"
-            f"<td{bad}>{page['forbidden']}</td></tr>"
+        variants.append(
+            {
+                "table": _table(variant or name, chosen, breaks),
+                "chart": _chart(variant or name, chosen),
+                "cases": list(_cases(chosen)),
+            }
         )
-    head = "".join(f'<th scope="col">{title}</th>' for title in HEAD)
+    mixed = name == "gloss-or-metal"
+    return {
+        "name": name,
+        "about": about[0],
+        "unit": about[1],
+        "variants": variants,
+        "confusion": _confusion([o for row in own for o in row.cases]) if mixed else None,
+    }
+
+
+def _table(
+    title: str, rows: Sequence[Row], breaks: Mapping[tuple[str, str, str], float | None]
+) -> Table:
+    """All severities, one way after the other."""
     ways = dict.fromkeys((row.hazard, row.variant, row.way) for row in rows)
-    at = ", ".join(
-        f"{way[2]}: {'none' if breaks[way] is None else f'{breaks[way]:g}'}" for way in ways
-    )
-    caption = f"{html.escape(title)}; breaks down at {at}; p5 to worst tenth in dB"
-    return (
-        f'<div class="wide"><table><caption>{caption}</caption><thead><tr>{head}</tr></thead>'
-        f"<tbody>{''.join(body)}</tbody></table></div>"
-    )
+    at = ", ".join(f"{w[2]}: {'none' if (b := breaks[w]) is None else f'{b:g}'}" for w in ways)
+    caption = f"{title}; breaks down at {at}; p5 to worst tenth in dB"
+    return Table(HEAD, [_row(row) for row in rows], caption)
 
 
-def _decibels(value: float) -> str:
-    return f"{value:.1f}" if math.isfinite(value) else "-"
+def _row(row: Row) -> list[Cell]:
+    page = cells(row, None)
+    scores = [page[name] for name in ("p5_db", "p50_db", "p95_db", "worst_tenth_db")]
+    return [
+        Cell(f"{row.severity:g}"),
+        Cell(row.way, is_text=True),
+        Cell(str(page["cases"])),
+        Cell(f"{page['rate']:.0%}"),
+        Cell(f"{page['low']:.0%} to {page['high']:.0%}"),
+        *(Cell(f"{score:.1f}" if math.isfinite(score) else "-") for score in scores),
+        *(Cell(str(page[name])) for name in ("assets", "noted", "refused")),
+        Cell(str(page["forbidden"]), is_bad=bool(page["forbidden"])),
+    ]
 
 
 def _chart(title: str, rows: Sequence[Row]) -> str:
-    """Median score over severity, a line for each way."""
-    width, height, margin = CHART
+    """Median score over severity, a line for each way; nothing where there is no course."""
     severities = sorted({row.severity for row in rows})
-    scores = [score for row in rows for score in row.scores]
-    low, high = math.floor(min(scores)) - 1, math.ceil(max(scores)) + 1
-
-    def x(severity: float) -> float:
-        place = severities.index(severity) / (len(severities) - 1)
-        return margin + place * (width - 1.5 * margin)
-
-    def y(score: float) -> float:
-        return height - margin * 0.7 - (score - low) / (high - low) * (height - margin)
-
     lines = []
     for way in dict.fromkeys(row.way for row in rows):
-        points = [
-            (x(row.severity), y(cells(row, None)["p50_db"]))
-            for row in rows
-            if row.way == way and row.scores
-        ]
-        colour = f"var(--{'ours' if way == OURS else 'plain'})"
-        dash = "" if way == OURS else ' stroke-dasharray="5 3"'
-        path = " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
-        lines.append(f'<polyline points="{path}" fill="none" stroke="{colour}"{dash}/>')
-        lines += [f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{colour}"/>' for a, b in points]
-    axis = "".join(
-        f'<text x="{x(s):.1f}" y="{height - 6}" text-anchor="middle">{s:g}</text>'
-        for s in severities
-    )
-    scale = "".join(f'<text x="2" y="{y(v) + 4:.1f}">{v}</text>' for v in (low, high))
-    label = html.escape(f"Median score in dB over severity: {title}")
-    return (
-        f'<figure><svg role="img" aria-label="{label}" width="{width}" height="{height}">'
-        f"{''.join(lines)}{axis}{scale}</svg><figcaption>dB over severity; ours drawn through, "
-        "plain dashed</figcaption></figure>"
-    )
+        scored = [row for row in rows if row.way == way and row.scores]
+        points = [(row.severity, cells(row, None)["p50_db"]) for row in scored]
+        if points:
+            lines.append(Line(way, sorted(points), "ours" if way == OURS else "plain"))
+    if len(severities) < 2 or not lines:
+        return ""
+    about = f"Median score over severity: {title}"
+    return line_chart(about, lines, unit="dB", ticks=severities)
 
 
-def _pictures(rows: Sequence[Row]) -> str:
+def _cases(rows: Sequence[Row]) -> Iterator[dict[str, str]]:
     """Of each severity the first seed, with what was told."""
-    figures = []
     for row in rows:
         first = row.cases[0]
         said = list(dict.fromkeys(first.notes))
         error = str(first.result.get("error", "")).strip()
         words = "; ".join([*said[:MOST_NOTES], *([error.splitlines()[-1]] if error else [])])
         about = f"severity {row.severity:g}, {row.way}: {first.verdict}"
-        text = html.escape(f"{about}. {words}" if words else about)
         strip = first.result.get("strip")
-        if strip:
-            alt = html.escape(
-                f"{row.hazard} {row.variant} {about}: two given views, then twice "
-                "truth beside asset"
-            )
-            figures.append(
-                f'<figure><img alt="{alt}" src="data:image/jpeg;base64,{strip}">'
-                f"<figcaption>{text}</figcaption></figure>"
-            )
-        elif words:
-            figures.append(f"<p>{text}</p>")
-    return "".join(figures)
+        if strip or words:
+            yield {
+                "text": f"{about}. {words}" if words else about,
+                "strip": f"data:image/jpeg;base64,{strip}" if strip else "",
+                "alt": f"{row.hazard} {row.variant} {about}: two given views, then twice truth "
+                "beside asset",
+            }
 
 
-def _confusion(judged: Sequence[Judged]) -> str:
+def _confusion(judged: Sequence[Judged]) -> Table:
     """What plastic and metal came out as."""
     counts = confusion([one for one in judged if one.case.way == OURS])
     names = {False: "plastic", True: "metal"}
-    body = "".join(
-        f'<tr><th scope="row" class="text">{names[was]}</th>'
-        f"<td>{counts[was, False]}</td><td>{counts[was, True]}</td></tr>"
+    rows = [
+        [Cell(names[was]), Cell(str(counts[was, False])), Cell(str(counts[was, True]))]
         for was in names
-    )
-    return (
-        "<table><caption>What each was, and came out as, over all severities</caption><thead><tr>"
-        '<th scope="col" class="text">was</th><th scope="col">plastic</th>'
-        f'<th scope="col">metal</th></tr></thead><tbody>{body}</tbody></table>'
-    )
+    ]
+    return Table(("was", "plastic", "metal"), rows)

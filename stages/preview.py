@@ -18,6 +18,7 @@ from torch import Tensor
 from stages.artifacts import ExportedAsset, FittedField, MaterialViews
 from stages.base import Context, Stage
 from stages.prefilter_cache import cached_operator
+from stages.preview_bounds import LEAST_DB, LEAST_OVERLAP, MOST_ANGLE_DEG
 from stages.settings.preview import PreviewConfig
 from svim3d.color import srgb_from_linear
 from svim3d.io.exr import read_rgb
@@ -34,11 +35,6 @@ MARGIN, LABEL_WIDTH, HEADER = 8, 104, 36  # pixels
 TEXT_PX, TITLE_PX = 13, 15
 AIR = 1.06  # pictures are cropped to the object and this much around it
 MIN_COVERAGE = 0.5  # pixels that the object mostly covers are compared
-# Beyond these an asset is told not to be what the views show. Assets of true views keep within
-# them: at worst 20 dB of radiance (shadows are not rendered), 26 of basecolor, 23 of metallic, 5.6
-# degrees and an overlap of 0.96.
-LEAST_DB = {"radiance": 18.0, "basecolor": 25.0, "roughness": 12.0, "metallic": 12.0}
-MOST_ANGLE_DEG, LEAST_OVERLAP = 9.0, 0.95
 
 Images = dict[str, Float[Tensor, "_ _ _ _"]]  # [views, rows, columns, channels]
 

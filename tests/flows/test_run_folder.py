@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from tiny_runs import compute, plan_tiny
 
-from flows.run_folder import write_run_folder
+from flows.pipeline import IMAGE_TO_ASSET
+from flows.run_folder import require_ours, write_run_folder
 from stages.errors import InputError
 
 
@@ -72,3 +73,14 @@ def test_folder_of_somebody_else_is_left_alone(store, source, tmp_path):
         write_run_folder(tmp_path / "out", plan, compute(plan, store), store, {})
     assert (tmp_path / "out" / "walk" / "diary.txt").read_text() == "mine"
     assert not (tmp_path / "out" / "run.json").exists()
+
+
+def test_the_folder_of_a_run_that_failed_is_taken_again(tmp_path, store, source):
+    # Such a folder holds a record and a report, and nothing of a finished run.
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "report.html").write_text("of a run that failed")
+    with pytest.raises(InputError, match=r"holds report\.html"):
+        require_ours(out, IMAGE_TO_ASSET)
+    (out / "record.json").write_text("{}")
+    require_ours(out, IMAGE_TO_ASSET)
