@@ -49,8 +49,8 @@ def read_truth(folder: Path) -> Truth:
     """
     index = _read_index(folder)
     given = None
-    if index.get("train"):
-        given = read_orbit(folder, wanted=_channels(folder / index["train"][0]["file"]))
+    if frames := index.get("train") or index.get("frames"):
+        given = read_orbit(folder, wanted=_channels(folder / frames[0]["file"]))
     tests = index.get("test", [])
     lights = sorted({name for frame in tests for name in frame.get("files", {})})
     views = {name: _test_views(folder, index, name) for name in lights}

@@ -1,4 +1,5 @@
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -146,10 +147,9 @@ def test_stanford_orb_s_rules_are_told_beside_ours(truth, tmp_path, ctx):
 
 
 def test_a_truth_of_pictures_alone_has_scores_of_pictures(truth, tmp_path, ctx):
-    import shutil
-
     bare = tmp_path / "bare"
     shutil.copytree(truth, bare)
+    (bare / "env_B.exr").unlink()  # of a light that no frame names
     (bare / "mesh.ply").unlink()
     index = json.loads((bare / "orbit.json").read_text())
     for frame in index["test"]:
@@ -198,3 +198,19 @@ def test_lpips_is_told_where_there_are_weights(kind, name, truth, tmp_path, ctx)
     figures = scores_of(scores, "relit", "asset", f"rgb_{name}")
     assert len(figures) == 4 and min(figures) > 0.0
     assert all(f"basecolor_{name}" in v.figures for v in scores.views if v.part == "given")
+
+
+def test_an_orbit_of_ours_without_test_views_has_scores_too(tmp_path, ctx):
+    views = drawn()
+    views.save(tmp_path)
+    scores = run(tmp_path, lit_asset(tmp_path), views, None, config=TINY, ctx=ctx)
+    assert {view.part for view in scores.views} == {"reference", "given"}
+
+
+@pytest.mark.parametrize("missing", ["train/000.exr", "test_C/001.exr", "env_B.exr"])
+def test_files_that_are_missing_are_named(missing, truth, tmp_path, ctx):
+    folder = tmp_path / "truth"
+    shutil.copytree(truth, folder)
+    (folder / missing).unlink()
+    with pytest.raises(InputError, match=missing):
+        run(folder, lit_asset(tmp_path), views_of(truth), None, config=TINY, ctx=ctx)
