@@ -125,7 +125,11 @@ ADVICE: Mapping[str, Advice] = {
     # The views.
     "few_views": _act("There are few views", MORE_VIEWS),
     "cut_off": _act("The object leaves the frame", "Frame it with a margin in every view."),
-    "soft_masks": _act("Outlines fade", "Give sharper masks."),
+    "soft_masks": _act("Outlines fade", "They were sharpened about half: give sharper masks."),
+    "background_bleeds": _act(
+        "The background shines through along outlines",
+        "Colours there are taken from inside. Cut the object out cleanly.",
+    ),
     "clipped_highlights": _act(
         "Highlights are cut off",
         "The light comes out too dim. Give radiance (.exr) from before it was clipped.",
