@@ -140,6 +140,7 @@ LIGHT = (
     "flows.batch_job",
     "flows.batch_options",
     "flows.batch_results",
+    "flows.cases",
     "flows.workers",
     "flows.cli",
     "flows.commands",
