@@ -11,7 +11,7 @@ from typing import Any
 from flows.cases import Outcome
 from flows.config import RunConfig
 from flows.pipeline import IMAGE_TO_ASSET
-from flows.plan import Selection, Step, make_plan
+from flows.plan import Plan, Selection, Step, make_plan
 from flows.steps import Bench, obtain_steps
 from stages.base import Progress
 from stages.errors import DivergenceError, InputError, StageTimeoutError, TransientError
@@ -61,25 +61,24 @@ def carry_out(
     return {"cpu_s": round(time.process_time() - start, 1)} | result
 
 
-def obtain_asset(
-    config: RunConfig,
-    source: Path,
-    *,
-    seed: int,
-    store: Store,
-    listener: Listener,
-    until: str | None = None,
-) -> dict[str, Stored]:
-    """Artifacts of all stages up to `until`, computed on the CPU where the store has none."""
-    plan = make_plan(
+def plan_asset(
+    config: RunConfig, source: Path, *, seed: int, store: Store, until: str | None = None
+) -> Plan:
+    """What a run up to a stage has to compute."""
+    selection = Selection(until=until)
+    return make_plan(
         IMAGE_TO_ASSET,
         config,
         source=source,
         seed=seed,
         store=store,
-        selection=Selection(until=until),
+        selection=selection,
         explained=False,
     )
+
+
+def obtain_asset(plan: Plan, store: Store, listener: Listener) -> dict[str, Stored]:
+    """Artifacts of all stages of a plan, computed on the CPU where the store has none."""
     return obtain_steps(Bench(plan, store, choose_device("cpu"), listener), retry_delays_s=())
 
 

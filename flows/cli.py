@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flows.batch_options import batch_options
+from flows.chart_options import chart_options
 from flows.data_options import data_options
 from flows.model_options import model_options
 from flows.operator_options import (
@@ -47,6 +48,7 @@ DOERS = {
     "logs": "flows.runs",
     "store": "flows.store",
     "stability": "flows.stability",
+    "chart": "flows.chart",
 }
 
 # Thread pools that spin while they wait starve each other: two of them on two cores made the
@@ -144,6 +146,11 @@ def _parser() -> argparse.ArgumentParser:
         ),
         ("automations", [shared], "let a Prefect server find and resume runs that were killed"),
         ("stability", [stability_options(), shared], "run the suite of hazards, and report"),
+        (
+            "chart",
+            [chart_options(), shared],
+            "measure what settings cost and give, and draw their front",
+        ),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
     ):

@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from flows.case_work import Listener, answer, events_of, obtain_asset
+from flows.case_work import Listener, answer, events_of, obtain_asset, plan_asset
 from flows.cases import Outcome
 from flows.config import PipelineConfig, load_config
 from stages.hazard_trial import HAZARDS, judge, lay_out, make_trial, spread_of_files, unwrap_torture
@@ -46,7 +46,8 @@ def _measured(request: dict[str, Any], listener: Listener) -> dict[str, Any]:
     config = load_config(PipelineConfig, request["preset"], overrides)
 
     def run(store: Store, seed: int) -> dict[str, Stored]:
-        return obtain_asset(config, given.source, seed=seed, store=store, listener=listener)
+        plan = plan_asset(config, given.source, seed=seed, store=store)
+        return obtain_asset(plan, store, listener)
 
     artifacts = run(store, case["seed"])
     asset = artifacts["export"].folder

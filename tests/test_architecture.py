@@ -71,6 +71,8 @@ MAY_IMPORT = {
     "stages.plateau": ("svim3d", "stages.base", "stages.settings"),
     "stages.precision": ("stages.settings",),
     "stages.view_remedies": ("svim3d", "stages.base", "stages.settings"),
+    "stages.given_views": ("svim3d", "stages.artifacts", "stages.errors", "stages.keys"),
+    "stages.invented_orbit": ("svim3d", "stages.keys"),
     "stages.store_cleaning": ("stages.store", "stages.locks", "stages.errors"),
     "stages.store_archive": (
         "stages.store",
@@ -92,6 +94,7 @@ MAY_IMPORT = {
         "stages.device_slot",
     ),
     "flows": ("flows", "stages"),
+    "flows.chart": ("flows", "stages", "svim3d.charts"),
     # What strangers send is looked at before a stage, which loads torch, sees it.
     "flows.service": ("flows", "stages", "svim3d.io.exr", "svim3d.io.photo_header"),
 }
@@ -120,6 +123,7 @@ DOORS = {
     "bpy": ("svim3d.io.cycles_scene",),
     "mathutils": ("svim3d.io.cycles_scene",),
     "trimesh": ("svim3d.io.glb", "svim3d.io.obj"),
+    "matplotlib": ("svim3d.charts",),
     "xatlas": ("svim3d.mesh.xatlas_process",),
     "mitsuba": ("svim3d.render.path_tracing",),
     "pymeshlab": ("svim3d.mesh.cleanup",),
@@ -141,6 +145,13 @@ LIGHT = (
     "flows.batch_options",
     "flows.batch_results",
     "flows.cases",
+    "flows.chart",
+    "flows.chart_front",
+    "flows.chart_knobs",
+    "flows.chart_options",
+    "flows.chart_page",
+    "flows.chart_points",
+    "flows.chart_table",
     "flows.workers",
     "flows.cli",
     "flows.commands",

@@ -5,8 +5,9 @@ import json
 import pytest
 
 from benchmarks.bench_capacity import foreseen, parse, row, scaled, table
-from benchmarks.capacity_scenes import SIMPLE, TEST_VIEWS, VIEWS, scene_orbit
+from benchmarks.capacity_scenes import SIMPLE, scene_orbit
 from flows.config import PipelineConfig, load_config
+from stages.invented_orbit import TEST_VIEWS, VIEWS
 from svim3d.io.orbit import read_orbit
 
 
