@@ -5,8 +5,9 @@
 Scenes are a sphere of one material, a patterned one, invented objects (`random-K`) and, with
 `--data` (default: SVIM3D_DATA), the path-traced orbits of that folder. Each is made into an asset
 twice, by `auto` and by the preset of `--against`. Time is CPU seconds of all stages from the views
-to the export; figures are those of `evaluate_asset.py`: relighting under two lights never seen (dB)
-and surface distance. A scene is kept where `auto` is within 0.2 dB and 2 % of the other.
+to the export; figures are those of `svim3d.render.asset_figures`: relighting under two lights
+never seen (dB) and surface distance. A scene is kept where `auto` is within 0.2 dB and 2 % of the
+other.
 
 `--scale 0.25 --size 128` makes both cheaper alike: step counts by the scale, grids, textures and
 rays by the views' size against 256. Results lie in `--results` as they come in; a case whose code,

@@ -29,7 +29,6 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.evaluate_asset import visible  # noqa: E402
 from stages.artifacts import FittedField, MaterialViews  # noqa: E402
 from stages.base import Context  # noqa: E402
 from stages.nerf import run  # noqa: E402
@@ -40,6 +39,7 @@ from svim3d.io.orbit import read_orbit  # noqa: E402
 from svim3d.mesh.marching import extract_surface  # noqa: E402
 from svim3d.metrics import distance_to_surface, mean_angle_deg, psnr, sample_surface  # noqa: E402
 from svim3d.numerics import normalize  # noqa: E402
+from svim3d.render.asset_figures import visible  # noqa: E402
 from svim3d.render.march import Rays  # noqa: E402
 from svim3d.render.volumes import SdfVolume  # noqa: E402
 from svim3d.render.volumetric import render_rays  # noqa: E402

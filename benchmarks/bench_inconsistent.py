@@ -9,7 +9,8 @@ the true test views, lights and mesh, which were never corrupted:
 
 - novel views: PSNR after AgX at the six test cameras under the light that was found;
 - relit: the same under the two true lights that were never seen;
-- basecolor (sRGB) and normals at those cameras, distance of the surfaces (see `evaluate_asset.py`).
+- basecolor (sRGB) and normals at those cameras, distance of the surfaces (see
+  `svim3d.render.asset_figures`).
 
 Means are over orbits of means over seeds. Differences to `--baseline` are paired by orbit and seed,
 with an interval of 95 % by bootstrap over orbits and their seeds. Every case must end with an asset

@@ -1,6 +1,7 @@
 """Scenes of the capacity benchmark: orbits with a known truth, from the simplest to the hardest.
 
-Procedural ones are rendered by `stages.invented_orbit`; orbits of the data folder are averaged down to the size asked for.
+Procedural ones are rendered by `stages.invented_orbit`; orbits of the data folder are averaged down
+to the size asked for.
 """
 
 from collections.abc import Callable

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.generator_scores import FIGURES, Turning
+from svim3d.metrics.statistics import bootstrap_interval
 
-DRAWS = 10_000  # of the bootstrap
-LEVEL = (2.5, 97.5)  # percentiles
 STEP_DEG = 360.0 / 21  # of an even orbit; views are binned by it, both sides of the object alike
 SHORT = (
     "rgb_psnr",
@@ -78,13 +77,8 @@ def interval(
         root: take the root of means of squares.
         seed: of the resampling; equal seeds draw equal objects.
     """
-    known = per_object[~np.isnan(per_object)]
-    if not len(known):
-        return {"mean": float("nan"), "low": float("nan"), "high": float("nan")}
-    generator = np.random.default_rng(seed)
-    means = known[generator.integers(0, len(known), (DRAWS, len(known)))].mean(1)
-    low, high = np.percentile(means, LEVEL)
-    told = {"mean": float(known.mean()), "low": float(low), "high": float(high)}
+    told = asdict(bootstrap_interval(per_object, seed=seed))
+    del told["count"]
     return {name: value**0.5 for name, value in told.items()} if root else told
 
 

@@ -17,7 +17,6 @@ import torch
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.evaluate_asset import LIGHT_SIZE, SUPERSAMPLE  # noqa: E402
 from benchmarks.pipeline_case import case_key, measure, plan_case  # noqa: E402
 from flows.plan import Plan  # noqa: E402
 from stages.errors import (  # noqa: E402
@@ -26,6 +25,7 @@ from stages.errors import (  # noqa: E402
     StageTimeoutError,
     TransientError,
 )
+from stages.settings.evaluation import EvaluationConfig  # noqa: E402
 from stages.store import Store  # noqa: E402
 from svim3d.io.exr import read_rgb  # noqa: E402
 from svim3d.io.glb import read_mesh  # noqa: E402
@@ -59,11 +59,12 @@ def view_db(asset: Path, truth: Path) -> float:
     """PSNR after AgX of the asset under its own light at the held-out cameras, on the true mask."""
     mesh = read_mesh(asset / "asset.glb")
     latlong = torch.from_numpy(read_rgb(asset / "environment.exr"))
-    light = octahedral_from_latlong(latlong, LIGHT_SIZE)
-    pyramid = PyramidOperator.build(LIGHT_SIZE)(light)
+    config = EvaluationConfig()
+    light = octahedral_from_latlong(latlong, config.light_size)
+    pyramid = PyramidOperator.build(config.light_size)(light)
     cameras, views, _ = read_orbit(truth, "test_A")
     shader = environment_shader(pyramid, multiple_scattering=True)
-    shown = render_pictures(mesh, cameras, shader, supersample=SUPERSAMPLE)["radiance"]
+    shown = render_pictures(mesh, cameras, shader, supersample=config.supersample)["radiance"]
     values = [
         psnr(agx(shown[v]), agx(views["radiance"][v]), views["mask"][v] > 0.5)
         for v in range(len(cameras))

@@ -4,11 +4,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
+from svim3d.metrics.statistics import mean_and_interval, paired
 
-DRAWS = 10_000  # of the bootstrap
-LEVEL = (2.5, 97.5)  # percentiles
 ASSET = "asset"  # the outcome of a case that ended with one
 
 
@@ -80,43 +77,6 @@ class Results:
         """Cases of a row that ended without an asset, and all of them."""
         ended = [o for c, o in self.outcomes.items() if (c.row, c.severity) == (row, severity)]
         return sum(o != ASSET for o in ended), len(ended)
-
-
-def mean_and_interval(
-    values: Mapping[tuple[str, int], float],
-) -> tuple[float, tuple[float, float] | None]:
-    """Mean over orbits of the mean over seeds, and its bootstrap interval of 95 %.
-
-    Orbits are drawn with replacement and, for each, its seeds; without two of either there is no
-    interval. A mean counts every orbit alike, however many of its seeds ended with an asset.
-    """
-    orbits = list(dict.fromkeys(orbit for orbit, _ in values))
-    by_orbit = [np.array([v for (o, _), v in values.items() if o == orbit]) for orbit in orbits]
-    mean = float(np.mean([seeds.mean() for seeds in by_orbit]))
-    if len(values) < 2:
-        return mean, None
-    generator = np.random.default_rng(0)
-    drawn = np.stack([_means_of_draws(seeds, len(orbits), generator) for seeds in by_orbit])
-    chosen = generator.integers(len(orbits), size=(DRAWS, len(orbits)))
-    place = np.arange(len(orbits))
-    means = drawn[chosen, np.arange(DRAWS)[:, None], place].mean(1)
-    low, high = np.percentile(means, LEVEL)
-    return mean, (float(low), float(high))
-
-
-def _means_of_draws(
-    seeds: NDArray[np.float64], places: int, generator: np.random.Generator
-) -> NDArray[np.float64]:
-    """Means of an orbit's seeds drawn anew, for each draw and each place it may be chosen for."""
-    index = generator.integers(len(seeds), size=(DRAWS, places, len(seeds)))
-    return seeds[index].mean(-1)
-
-
-def paired(
-    one: Mapping[tuple[str, int], float], other: Mapping[tuple[str, int], float]
-) -> dict[tuple[str, int], float]:
-    """One minus other, of the orbits and seeds that both have."""
-    return {pair: value - other[pair] for pair, value in one.items() if pair in other}
 
 
 def table(results: Results, baseline: str, figures: Iterable[Figure] = FIGURES) -> str:

@@ -16,13 +16,13 @@ import torch
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.evaluate_asset import evaluate  # noqa: E402
 from flows.config import PipelineConfig, load_config  # noqa: E402
 from flows.pipeline import IMAGE_TO_ASSET, SOURCE  # noqa: E402
 from flows.plan import Plan, Selection, Verdict, make_plan  # noqa: E402
+from flows.scoring import obtain_scores, scores_recipe  # noqa: E402
 from stages.execution import run_stage  # noqa: E402
+from stages.settings.evaluation import EvaluationConfig  # noqa: E402
 from stages.store import Store, Stored  # noqa: E402
-from svim3d.io.exr import read_rgb  # noqa: E402
 
 LAST_STAGE = "export"  # what the figures are about; the preview sheet is not counted
 
@@ -69,10 +69,9 @@ def measure(plan: Plan, store: Store, truth: Path) -> dict[str, Any]:
     """Seconds, memory and quality of one case; `truth` is the orbit that it is held against."""
     done = run_case(plan, store)
     records = {name: stored.manifest.record for name, stored in done.items()}
-    phase0 = None
-    if "env_preopt" in done:
-        phase0 = torch.from_numpy(read_rgb(done["env_preopt"].folder / "environment.exr"))
-    figures = evaluate(done[LAST_STAGE].folder / "asset.glb", truth, phase0)
+    config = EvaluationConfig()
+    recipe = scores_recipe(plan, truth, config)
+    figures = obtain_scores(recipe, done, truth, config=config, store=store)
     return {
         "key": case_key(plan),
         "seconds": {name: record["seconds"] for name, record in records.items()},

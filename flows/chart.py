@@ -65,8 +65,11 @@ def chart(options: argparse.Namespace) -> int:
     results: dict[Case, Mapping[str, Any]] = {}
     for case, result in _measure(points, bench, options, console):
         results[case] = result
-        _write(summarised(points, list(orbits), results), told, options.output)
+        ended = sum(case.point == other.point for other in results)
+        if ended % len(orbits) == 0:  # a point is known on all of them
+            _write(summarised(points, list(orbits), results), told, options.output)
     summary = summarised(points, list(orbits), results)
+    _write(summary, told, options.output)
     for line in conclusions(summary):
         console.print(line.removeprefix("- "), highlight=False, markup=False, soft_wrap=True)
     console.print(f"{options.output / 'chart.html'}: {len(summary.figures)} points", style="bold")
@@ -170,11 +173,8 @@ def _measure(
         return
     _warm_up(bench, console)
     start = time.monotonic()
-    done = 0
-    for case, result in run_cases(
-        waiting, lambda c: bench.start(by_name[c.point], c), options.jobs
-    ):
-        done += 1
+    results = run_cases(waiting, lambda c: bench.start(by_name[c.point], c), options.jobs)
+    for done, (case, result) in enumerate(results, 1):
         left_s = (time.monotonic() - start) / done * (len(waiting) - done)
         console.print(
             f"[{done}/{len(waiting)}] {case.name}: {_in_a_line(result)}, "

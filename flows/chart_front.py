@@ -8,15 +8,16 @@ interval over orbits, and exceeds what repeats with other seeds differ by. Since
 differences add up, this order has no circles.
 """
 
-import itertools
+import functools
 import math
-import random
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
-LEVEL = 0.95  # of intervals
-MOST_DRAWS = 4096  # up to here all resamples are listed: five orbits have 3,125
+if TYPE_CHECKING:
+    from stages.statistics import Interval
+
 NOISE_SPREADS = 2.0  # standard errors that count as noise
 
 
@@ -77,54 +78,40 @@ Values = Mapping[str, float]
 Figures = Mapping[str, Mapping[str, Values]]
 
 
-@dataclass(frozen=True)
-class Difference:
-    """Mean over orbits of a paired difference of badness, and its interval."""
-
-    mean: float
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, differences: Sequence[float]) -> "Difference":
-        """The bootstrap over orbits; one orbit has an interval without width."""
-        if not differences:
-            return cls(math.nan, math.nan, math.nan)
-        drawn = sorted(resampled_means(differences))
-        tail = (1.0 - LEVEL) / 2.0
-        last = len(drawn) - 1
-        low, high = drawn[math.floor(tail * last)], drawn[math.ceil((1.0 - tail) * last)]
-        return cls(math.fsum(differences) / len(differences), low, high)
-
-    def is_gain(self, noise: float) -> bool:
-        """Whether it is better beyond the noise."""
-        return self.high < 0.0 and self.mean < -noise
-
-    def is_loss(self, noise: float) -> bool:
-        """Whether it is worse beyond the noise."""
-        return self.low > 0.0 and self.mean > noise
+def laid(figures: Figures, point: str, axis: Axis) -> dict[str, float]:
+    """A point's badness by orbit."""
+    return {o: axis.badness(values[axis.name]) for o, values in figures[point].items()}
 
 
-def resampled_means(values: Sequence[float]) -> list[float]:
-    """Means of samples with replacement: of all there are, where they are few, else of many."""
-    count = len(values)
-    if count**count <= MOST_DRAWS:
-        samples: Iterable[Sequence[float]] = itertools.product(values, repeat=count)
-    else:
-        generator = random.Random(0)
-        samples = (generator.choices(values, k=count) for _ in range(MOST_DRAWS))
-    return [math.fsum(sample) / count for sample in samples]
+def mean_badness(figures: Figures, point: str, axis: Axis) -> float:
+    """Mean over orbits of a point's badness."""
+    values = laid(figures, point, axis).values()
+    return math.fsum(values) / len(values)
 
 
-def difference(figures: Figures, point: str, other: str, axis: Axis) -> Difference:
+def difference(figures: Figures, point: str, other: str, axis: Axis) -> "Interval":
     """How much worse `point` is than `other`, over the orbits that both have."""
-    return Difference.of(
-        [
-            axis.badness(values[axis.name]) - axis.badness(figures[other][orbit][axis.name])
-            for orbit, values in figures[point].items()
-            if orbit in figures[other]
-        ]
-    )
+    one, two = (tuple(sorted(laid(figures, name, axis).items())) for name in (point, other))
+    return _interval(one, two)
+
+
+@functools.lru_cache(maxsize=1 << 16)  # panels share axes, and pages are written again and again
+def _interval(
+    one: tuple[tuple[str, float], ...], other: tuple[tuple[str, float], ...]
+) -> "Interval":
+    from stages.statistics import paired_interval
+
+    return paired_interval(dict(one), dict(other))
+
+
+def mean_difference(figures: Figures, point: str, other: str, axis: Axis) -> float:
+    """The same without an interval."""
+    return mean_badness(figures, point, axis) - mean_badness(figures, other, axis)
+
+
+def is_gain(apart: "Interval", noise: float) -> bool:
+    """Whether a difference is one to the better, beyond the noise."""
+    return apart.high < 0.0 and apart.mean < -noise
 
 
 def repeat_noise(repeats: Iterable[Sequence[Values]], axis: Axis) -> float:
@@ -189,12 +176,6 @@ def standings(
     return found
 
 
-def mean_badness(figures: Figures, point: str, axis: Axis) -> float:
-    """Mean over orbits of a figure's badness."""
-    laid = [axis.badness(values[axis.name]) for values in figures[point].values()]
-    return math.fsum(laid) / len(laid)
-
-
 def _ahead_of(
     point: str, figures: Figures, axes: Sequence[Axis], noise: Mapping[str, float]
 ) -> dict[str, bool]:
@@ -203,10 +184,12 @@ def _ahead_of(
     for other in figures:
         if other == point:
             continue
-        apart = {axis.name: difference(figures, other, point, axis) for axis in axes}
-        means = [d.mean for d in apart.values()]
+        means = [mean_difference(figures, other, point, axis) for axis in axes]
         if all(mean <= 0.0 for mean in means) and any(mean < 0.0 for mean in means):
-            found[other] = any(d.is_gain(noise.get(name, 0.0)) for name, d in apart.items())
+            found[other] = any(
+                is_gain(difference(figures, other, point, axis), noise.get(axis.name, 0.0))
+                for axis in axes
+            )
     return found
 
 
@@ -220,7 +203,8 @@ def ladder(figures: Figures, cost: Axis, quality: Axis, noise: Mapping[str, floa
     front.sort(key=lambda point: mean_badness(figures, point, cost))
     taken = front[:1]
     for point in front[1:]:
-        if difference(figures, point, taken[-1], quality).is_gain(noise.get(quality.name, 0.0)):
+        apart = difference(figures, point, taken[-1], quality)
+        if is_gain(apart, noise.get(quality.name, 0.0)):
             taken.append(point)
     return taken
 
@@ -233,11 +217,11 @@ def knee(figures: Figures, steps: Sequence[str], cost: Axis, quality: Axis) -> s
     first, last = steps[0], steps[-1]
     if len(steps) < 3:
         return last
-    span_cost = difference(figures, last, first, cost).mean
-    span_gain = -difference(figures, last, first, quality).mean
+    span_cost = mean_difference(figures, last, first, cost)
+    span_gain = -mean_difference(figures, last, first, quality)
 
     def above(point: str) -> float:
-        spent = difference(figures, point, first, cost).mean / span_cost
-        return -difference(figures, point, first, quality).mean / span_gain - spent
+        spent = mean_difference(figures, point, first, cost) / span_cost
+        return -mean_difference(figures, point, first, quality) / span_gain - spent
 
     return max(steps[1:-1], key=above)

@@ -15,7 +15,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from svim3d.cameras import Cameras
 from svim3d.fields.material_field import MaterialField, MaterialFieldSpec
-from svim3d.io.exr import read_rgb, write_rgb
+from svim3d.io.exr import MAX_HALF, read_rgb, write_rgb
 from svim3d.io.image import read_png, write_png
 from svim3d.io.orbit import read_orbit, write_orbit
 from svim3d.io.orbit_sheet import orbit_sheet
@@ -117,14 +117,18 @@ class EnvironmentLight:
     def save(self, folder: Path) -> None:
         """Write the octahedral map in full precision and a lat-long picture of it."""
         write_rgb(folder / "environment_octahedral.exr", self.radiance.numpy(), half=False)
-        height = max(16, self.radiance.shape[0])
-        latlong = latlong_from_octahedral(self.radiance, height=height)
-        write_rgb(folder / "environment.exr", latlong.numpy(), half=True)
+        write_rgb(folder / "environment.exr", self.latlong().numpy(), half=True)
 
     @classmethod
     def load(cls, folder: Path) -> Self:
         """Read the octahedral map."""
         return cls(torch.from_numpy(read_rgb(folder / "environment_octahedral.exr")))
+
+    def latlong(self) -> Float[Tensor, "H W 3"]:
+        """The map as the picture that is written has it, in half floats."""
+        height = max(16, self.radiance.shape[0])
+        latlong = latlong_from_octahedral(self.radiance, height=height)
+        return latlong.clamp_max(MAX_HALF).half().float()
 
     def headline(self) -> str:
         """Size and mean brightness of the map."""

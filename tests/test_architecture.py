@@ -122,7 +122,7 @@ DOORS = {
     # A script for an interpreter of its own: nothing imports it.
     "bpy": ("svim3d.io.cycles_scene",),
     "mathutils": ("svim3d.io.cycles_scene",),
-    "trimesh": ("svim3d.io.glb", "svim3d.io.obj"),
+    "trimesh": ("svim3d.io.glb", "svim3d.io.obj", "svim3d.io.triangles"),
     "matplotlib": ("svim3d.charts",),
     "xatlas": ("svim3d.mesh.xatlas_process",),
     "mitsuba": ("svim3d.render.path_tracing",),
@@ -176,6 +176,7 @@ LIGHT = (
     "flows.run_folder",
     "flows.run_records",
     "flows.runs",
+    "flows.scoring",
     "flows.stability",
     "flows.stability_cases",
     "flows.stability_figures",

@@ -9,12 +9,13 @@ from sphere_orbit import sphere_cameras, sphere_images
 from benchmarks import bench_inconsistent
 from benchmarks.bench_inconsistent import ASSET, CRASHED, REFUSED, TOO_LONG, cases, parse
 from benchmarks.inconsistent_orbit import corrupted_orbit
-from benchmarks.inconsistent_report import Case, Results, draw, mean_and_interval, paired, table
+from benchmarks.inconsistent_report import Case, Results, draw, table
 from benchmarks.inconsistent_rows import ROWS, SMALL, overrides_of
 from benchmarks.pipeline_case import case_key, plan_case
 from stages.errors import InputError
 from stages.store import Store
 from svim3d.io.orbit import CHANNELS, read_orbit, write_orbit
+from svim3d.metrics.statistics import mean_and_interval, paired
 from svim3d.synthesis.inconsistency import Strengths
 
 SIZE = 32

@@ -5,7 +5,7 @@ import torch
 from sphere_orbit import sphere_cameras, sphere_images
 
 from svim3d.color import srgb_from_linear
-from svim3d.metrics import SSIM_C1
+from svim3d.metrics.pictures import SSIM_C1
 from svim3d.render.perceptual import (
     CHANNELS,
     crop_around,

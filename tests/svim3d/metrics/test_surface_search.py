@@ -1,16 +1,11 @@
-import math
-
 import numpy as np
 import pytest
 import torch
 
 from svim3d.metrics import (
     distance_to_surface,
-    mean_angle_deg,
     occupancy,
-    psnr,
     sample_surface,
-    structural_similarity,
     volume_iou,
 )
 
@@ -35,46 +30,6 @@ def test_cube_winds_outward():
     vertices, faces = cube()
     normal = torch.linalg.cross(*[vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2)])
     assert bool(((normal * vertices[faces].mean(1)).sum(1) > 0).all())
-
-
-def test_psnr_of_a_constant_error_inside_the_mask():
-    truth = torch.zeros(4, 4, 3)
-    mask = torch.zeros(4, 4, 1, dtype=torch.bool)
-    mask[:2] = True
-    image = torch.where(mask, 0.1, 1.0).expand(4, 4, 3)
-    assert psnr(image, truth, mask) == pytest.approx(20.0, abs=1e-5)
-    assert psnr(truth, truth, mask) == math.inf
-
-
-@pytest.mark.parametrize("angle_deg", [0.0, 1e-4, 1.0, 90.0, 179.999, 180.0])
-def test_mean_angle_is_exact_at_all_angles_and_any_length(angle_deg):
-    a = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
-    angle = torch.tensor(angle_deg, dtype=torch.float64).deg2rad()
-    b = 3.0 * torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)])[None]
-    assert mean_angle_deg(a, b, torch.tensor([[True]])) == pytest.approx(angle_deg, abs=1e-9)
-
-
-def test_uncovered_pixels_count_as_a_right_angle():
-    a, b = torch.eye(3), torch.eye(3)
-    b[2] = 0
-    assert mean_angle_deg(a, b, torch.ones(3, 1, dtype=torch.bool)) == pytest.approx(30.0)
-
-
-def test_similarity_of_flat_pictures_is_the_closed_form():
-    a, b = 0.3, 0.7
-    found = structural_similarity(torch.full((1, 16, 16, 3), a), torch.full((1, 16, 16, 3), b))
-    expected = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
-    torch.testing.assert_close(found, torch.full((1, 16, 16, 1), expected), atol=1e-4, rtol=0.0)
-
-
-def test_similarity_of_a_negative_is_minus_one():
-    # About a mean of one half both pictures have the same means and opposite covariance; noise is
-    # large against the constants that keep flat pictures defined, but its window means are not
-    # exactly one half.
-    noise = torch.rand(1, 64, 64, 1, generator=torch.Generator().manual_seed(0), dtype=torch.double)
-    noise = (noise > 0.5).double()
-    similar = structural_similarity(noise, 1.0 - noise)
-    assert float(similar.mean()) == pytest.approx(-1.0, abs=0.08)
 
 
 def test_samples_are_uniform_by_area():
