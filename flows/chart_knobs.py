@@ -62,13 +62,14 @@ def _both(name: str, *values: object) -> tuple[Turn, ...]:
     return tuple(Turn(str(v), (f"nerf.{name}={v}", f"dmtet.{name}={v}")) for v in values)
 
 
-def _rates(*factors: float) -> tuple[Turn, ...]:
-    """Phase 2's rates of surface and materials, by factors of what they are (`dmtet`)."""
-    rates = {"sdf_rate": 0.01, "offset_rate": 0.01, "field_rate": 4e-4, "network_rate": 2e-4}
-    return tuple(
-        Turn(f"x{factor:g}", tuple(f"dmtet.{n}={rate * factor:.3g}" for n, rate in rates.items()))
-        for factor in factors
-    )
+SURFACE_RATES = {"sdf_rate": 0.01, "offset_rate": 0.01}
+MATERIAL_RATES = {"field_rate": 4e-4, "network_rate": 2e-4}
+
+
+def _rates(what: str, rates: dict[str, float], factor: float) -> Turn:
+    """Rates of phase 2 by a factor of what they are."""
+    changes = tuple(f"dmtet.{name}={rate * factor:.3g}" for name, rate in rates.items())
+    return Turn(f"{what}x{factor:g}", changes)
 
 
 REMEDIES_OFF = (
@@ -188,7 +189,12 @@ KNOBS = (
     Knob(
         "phase2-rates",
         "step sizes of surface and materials in phase 2, at 150 steps",
-        _rates(0.3, 3.0),
+        (
+            _rates("surface-", SURFACE_RATES, 0.3),
+            _rates("surface-", SURFACE_RATES, 3.0),
+            _rates("materials-", MATERIAL_RATES, 0.3),
+            _rates("materials-", MATERIAL_RATES, 3.0),
+        ),
         stage="dmtet",
         steps=PHASE_2_STEPS,
     ),
