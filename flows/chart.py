@@ -22,6 +22,7 @@ from flows.chart_table import (
     rows_of,
     settings_of,
     summarised,
+    write_cases,
     write_csv,
     write_presets,
 )
@@ -31,6 +32,7 @@ from svim3d.charts import Mark, Panel, draw_panels, is_available
 
 DONE, FAILED = 0, 1
 INVENTED_PX = 128  # side of views that are rendered here, unless --size says otherwise
+WRITTEN_EVERY_S = 300.0  # the pages, while cases are run
 QUICK_PRESETS = ("standard",)
 NO_KNOBS = ["none"]
 WARM_UP = Point(
@@ -63,16 +65,22 @@ def chart(options: argparse.Namespace) -> int:
     bench = Bench(orbits, options.size, options.photos, options.store, options.limit)
     told = _told(options, bench)
     results: dict[Case, Mapping[str, Any]] = {}
+    written_s = time.monotonic()
     for case, result in _measure(points, bench, options, console):
         results[case] = result
-        ended = sum(case.point == other.point for other in results)
-        if ended % len(orbits) == 0:  # a point is known on all of them
+        if time.monotonic() - written_s > WRITTEN_EVERY_S:
             _write(summarised(points, list(orbits), results), told, options.output)
+            written_s = time.monotonic()
     summary = summarised(points, list(orbits), results)
     _write(summary, told, options.output)
+    write_cases(results, options.output / "cases.csv")
     for line in conclusions(summary):
         console.print(line.removeprefix("- "), highlight=False, markup=False, soft_wrap=True)
-    console.print(f"{options.output / 'chart.html'}: {len(summary.figures)} points", style="bold")
+    console.print(
+        f"{options.output / 'chart.html'}: {len(summary.figures)} points",
+        highlight=False,
+        soft_wrap=True,
+    )
     return FAILED if summary.failures else DONE
 
 

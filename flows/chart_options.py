@@ -21,8 +21,8 @@ def chart_options() -> argparse.ArgumentParser:
         type=Path,
         default=Path("out/chart"),
         metavar="OUT",
-        help="folder of results.jsonl, chart.csv, .md, .png, .svg and .html and the recommended "
-        "presets (%(default)s)",
+        help="folder of results.jsonl, cases.csv, chart.csv, .md, .png, .svg and .html, and the "
+        "recommended presets (%(default)s)",
     )
     options.add_argument(
         "--base",

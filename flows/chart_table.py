@@ -170,6 +170,18 @@ def write_csv(rows: Sequence[Mapping[str, Any]], file: Path) -> None:
             writer.writerow({n: f"{v:.6g}" if isinstance(v, float) else v for n, v in row.items()})
 
 
+def write_cases(results: Mapping[Case, Mapping[str, Any]], file: Path) -> None:
+    """Every case with all its costs and figures, and the CPU seconds of each stage."""
+    lines = [
+        {"point": case.point, "orbit": case.orbit, "seed": case.seed, "outcome": result["outcome"]}
+        | dict(result.get("costs", {}))
+        | dict(result.get("figures", {}))
+        | {f"{stage}_cpu_s": value for stage, value in result.get("stage_cpu_s", {}).items()}
+        for case, result in results.items()
+    ]
+    write_csv(lines, file)
+
+
 def shown_level(axis: Axis, value: float) -> str:
     """A value in a table."""
     return f"{value * axis.scale:.{axis.digits}f}"
