@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Console
 
 from flows.cases import Outcome, Results, run_cases
-from flows.chart_front import AXES, PANELS, RELIGHT, State
+from flows.chart_front import AXES, PANELS, RELIGHT, State, ladder
 from flows.chart_knobs import KNOBS, SCALES, Knob, quick
 from flows.chart_page import mean_range, write_page
 from flows.chart_points import PRESET, Bench, Case, Point, points_of
@@ -166,9 +166,10 @@ def _measure(
 ) -> Iterator[tuple[Case, Mapping[str, Any]]]:
     """Results of all cases as they come: those that are known first, then point by point."""
     by_name = {point.name: point for point in points}
-    # The base with all its seeds first: everything is held against it.
-    cases = [Case(points[0].name, o, seed) for seed in range(options.repeats) for o in bench.orbits]
-    cases += [Case(point.name, orbit, 0) for point in points[1:] for orbit in bench.orbits]
+    # Point by point, the base first: all others are held against it. Its repeats come last.
+    cases = [Case(point.name, orbit, 0) for point in points for orbit in bench.orbits]
+    repeats = range(1, options.repeats)
+    cases += [Case(points[0].name, orbit, seed) for seed in repeats for orbit in bench.orbits]
     kept = Results[Case](options.output, any_code=options.keep)
     keys = {case: bench.key(by_name[case.point], case) for case in cases}
     known = {case: kept.get(case, keys[case]) for case in cases}
@@ -242,6 +243,7 @@ def panels_of(summary: Summary, rows: Sequence[Mapping[str, Any]]) -> list[Panel
     panels = []
     for cost, quality in PANELS:
         marks = []
+        steps = ladder(summary.figures, cost, quality, summary.noise)
         for row in rows:
             name = str(row["point"])
             state = summary.panels[cost.name, quality.name][name].state
@@ -255,9 +257,10 @@ def panels_of(summary: Summary, rows: Sequence[Mapping[str, Any]]) -> list[Panel
                     y=summary.mean(name, quality) * quality.scale,
                     y_range=(low * quality.scale, high * quality.scale),
                     is_front=state is State.FRONT,
-                    is_named=state is State.FRONT or point.group == PRESET,
+                    is_named=name in steps or point.group == PRESET,
                 )
             )
+        marks.sort(key=lambda mark: (mark.group != PRESET, not mark.is_named, mark.x))
         is_log = axes[quality.name].is_ratio
         panels.append(Panel(cost.title, quality.title, marks, is_log, quality.more_is_better))
     return panels

@@ -24,44 +24,7 @@ def chart_options() -> argparse.ArgumentParser:
         help="folder of results.jsonl, cases.csv, chart.csv, .md, .png, .svg and .html, and the "
         "recommended presets (%(default)s)",
     )
-    options.add_argument(
-        "--base",
-        default="preview",
-        metavar="PRESET",
-        help="a preset, or a .yaml file, that knobs are turned at (%(default)s)",
-    )
-    options.add_argument(
-        "--presets",
-        type=_names,
-        default=["preview", "standard", "paper", "auto"],
-        metavar="P,P,...",
-        help="measured as they are, beside the base (preview,standard,paper,auto)",
-    )
-    options.add_argument(
-        "--knobs",
-        type=_names,
-        metavar="K,K,...",
-        help="by name, or K:V+V for some values of one alone; `none` (all; see --list)",
-    )
-    options.add_argument(
-        "--scales",
-        type=_numbers,
-        metavar="F,F,...",
-        help="factors of all step counts of the base together (0.25,0.5,2,4)",
-    )
-    options.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="STAGE.NAME=VALUE",
-        help="change one setting of all points; may be repeated",
-    )
-    options.add_argument(
-        "--quick",
-        action="store_true",
-        help="the base, standard and the ends of the knobs that matter most",
-    )
-    options.add_argument("--list", action="store_true", help="name the points, and run nothing")
+    _add_points(options)
     options.add_argument(
         "--photos",
         action="store_true",
@@ -94,6 +57,48 @@ def chart_options() -> argparse.ArgumentParser:
         "--keep", action="store_true", help="take results of other code and settings as well"
     )
     return options
+
+
+def _add_points(options: argparse.ArgumentParser) -> None:
+    points = options.add_argument_group("points")
+    points.add_argument(
+        "--base",
+        default="preview",
+        metavar="PRESET",
+        help="a preset, or a .yaml file, that knobs are turned at (%(default)s)",
+    )
+    points.add_argument(
+        "--presets",
+        type=_names,
+        default=["preview", "standard", "paper", "auto"],
+        metavar="P,P,...",
+        help="measured as they are, beside the base (preview,standard,paper,auto)",
+    )
+    points.add_argument(
+        "--knobs",
+        type=_names,
+        metavar="K,K,...",
+        help="by name, or K:V+V for some values of one alone; `none` (all; see --list)",
+    )
+    points.add_argument(
+        "--scales",
+        type=_numbers,
+        metavar="F,F,...",
+        help="factors of all step counts of the base together (0.25,0.5,2,4)",
+    )
+    points.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="STAGE.NAME=VALUE",
+        help="change one setting of all points; may be repeated",
+    )
+    points.add_argument(
+        "--quick",
+        action="store_true",
+        help="the base, standard and the ends of the knobs that matter most",
+    )
+    points.add_argument("--list", action="store_true", help="name the points, and run nothing")
 
 
 def _names(text: str) -> list[str]:

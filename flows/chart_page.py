@@ -29,7 +29,7 @@ form { display: flex; flex-wrap: wrap; gap: .4rem 1.2rem; align-items: center; m
 #chart .point { cursor: pointer; stroke-width: 2; }
 #chart .point:focus { outline: none; stroke: var(--ink); stroke-width: 4; }
 #told { min-height: 9.5rem; background: var(--soft); border-radius: 6px; padding: .6rem 1rem; }
-#told dl { display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr));
+#told dl { display: grid; grid-template-columns: repeat(auto-fill, minmax(21rem, 1fr));
   margin: .3rem 0; gap: 0 1rem; }
 #told div { display: flex; justify-content: space-between; }
 #told dd { margin: 0; font-variant-numeric: tabular-nums; }
@@ -67,7 +67,7 @@ function ticks(low, high, isLog) {
     for (let e = Math.floor(Math.log10(low)); e <= Math.log10(high); e++)
       for (const s of steps) found.push(s * 10 ** e);
   } else {
-    const raw = (high - low) / 6, power = 10 ** Math.floor(Math.log10(raw));
+    const raw = (high - low) / 9, power = 10 ** Math.floor(Math.log10(raw));
     const step = [1, 2, 5, 10].find(s => s * power >= raw) * power;
     for (let i = Math.ceil(low / step); i * step <= high; i++) found.push(i * step);
   }
@@ -112,6 +112,21 @@ function draw() {
   const path = front.map((p, i) => (i ? `H${sx.at(p.mean[x.name])}V` :
     `M${sx.at(p.mean[x.name])} `) + sy.at(p.mean[y.name])).join('') + `H${W - M.r}`;
   svg.append(node('path', {class: 'front', d: path}));
+  const taken = [];
+  const place = (p, cx, cy) => {
+    const width = p.name.length * 6.6;
+    for (const [dx, dy] of [[10, -7], [-10 - width, -7], [10, 18], [-10 - width, 18]]) {
+      const box = [cx + dx, cy + dy - 11, cx + dx + width, cy + dy + 3];
+      if (box[0] < M.l || box[2] > W || taken.some(o => box[0] < o[2] && o[0] < box[2] &&
+        box[1] < o[3] && o[1] < box[3])) continue;
+      taken.push(box);
+      svg.append(node('text', {x: cx + dx, y: cy + dy}, p.name));
+      return;
+    }
+  };
+  const isNamed = p => front.includes(p) || p.group === 'presets';
+  for (const p of [...order].sort((a, b) => (b.group === 'presets') - (a.group === 'presets')))
+    if (isNamed(p)) place(p, sx.at(p.mean[x.name]), sy.at(p.mean[y.name]));
   for (const p of order) {
     const [cx, cy] = [sx.at(p.mean[x.name]), sy.at(p.mean[y.name])], [a, b] = p.range[y.name];
     svg.append(node('line', {class: 'range', x1: cx, x2: cx, y1: sy.at(a), y2: sy.at(b)}));
@@ -123,8 +138,6 @@ function draw() {
     for (const event of ['focus', 'mouseenter', 'click'])
       dot.addEventListener(event, () => tell(p));
     svg.append(dot);
-    if (isFront || p.group === 'presets')
-      svg.append(node('text', {x: cx + 10, y: cy - 7}, p.name));
   }
 }
 function tell(p) {
@@ -167,7 +180,7 @@ document.querySelectorAll('th button').forEach((button, column) => {
   });
 });
 draw();
-if (data.points.length) tell(data.points[0]);
+if (data.points.length) tell(data.points.find(p => p.group === 'presets') ?? data.points[0]);
 """
 
 
@@ -195,7 +208,7 @@ def write_page(
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<title>Speed against accuracy</title><style>{STYLE}</style></head><body><main>",
         "<h1>Speed against accuracy</h1>",
-        *(f"<p>{html.escape(line)}</p>" for line in told),
+        *(f"<p>{_marked(line)}</p>" for line in told),
         f'<form aria-label="Axes">{_choice("x", "Cost", COSTS, CPU)}'
         f"{_choice('y', 'Quality', QUALITIES, RELIGHT)}</form>",
         '<svg id="chart" viewBox="0 0 1000 560" role="group" '

@@ -13,6 +13,7 @@ PANEL_INCHES = (5.4, 4.3)
 LEGEND_INCHES = 0.5  # below all panels, for each row of groups
 LEGEND_COLUMNS = 8
 DOTS_PER_INCH = 110
+POINTS_PER_PIXEL = 72.0 / DOTS_PER_INCH
 STYLE = {
     "font.size": 9.0,
     "axes.spines.top": False,
@@ -20,7 +21,10 @@ STYLE = {
     "svg.hashsalt": "svim3d",  # equal pictures give equal bytes
     "svg.fonttype": "none",
 }
-GREY, FRONT_COLOUR = "0.55", "0.25"
+FRONT_COLOUR = "0.25"
+NAME_POINTS = 7
+LETTER_PX, LINE_PX = 6.0, 11.0  # of a name at that size, about
+PLACES = ((7, 4), (-7, 4), (7, -13), (-7, -13), (12, 14), (-12, 14))  # right and up of a point
 SHAPES = ("o", "s", "^", "v", "D", "P", "X", "<", ">", "p")
 
 
@@ -35,7 +39,7 @@ class Mark:
         y: quality.
         y_range: ends of the interval of y.
         is_front: whether it is filled; others are hollow.
-        is_named: whether its name is written.
+        is_named: whether its name is written, where there is room; first ones come first.
     """
 
     name: str
@@ -81,7 +85,7 @@ def draw_panels(panels: Sequence[Panel], title: str, form: Literal["png", "svg"]
     from matplotlib import pyplot
 
     groups = list(dict.fromkeys(mark.group for panel in panels for mark in panel.marks))
-    looks = {g: (f"C{i % 10}", SHAPES[i % len(SHAPES)]) for i, g in enumerate(groups)}
+    looks = {g: (f"C{i % 10}", SHAPES[(i + i // 10) % len(SHAPES)]) for i, g in enumerate(groups)}
     rows = -(-len(panels) // COLUMNS)
     legend_rows = -(-len(groups) // LEGEND_COLUMNS)
     size = (
@@ -90,7 +94,12 @@ def draw_panels(panels: Sequence[Panel], title: str, form: Literal["png", "svg"]
     )
     with pyplot.rc_context(STYLE):
         figure, axes = pyplot.subplots(
-            rows, min(COLUMNS, len(panels)), figsize=size, layout="constrained", squeeze=False
+            rows,
+            min(COLUMNS, len(panels)),
+            figsize=size,
+            dpi=DOTS_PER_INCH,
+            layout="constrained",
+            squeeze=False,
         )
         for axis in axes.flat[len(panels) :]:
             axis.set_visible(False)
@@ -107,6 +116,10 @@ def draw_panels(panels: Sequence[Panel], title: str, form: Literal["png", "svg"]
             frameon=False,
         )
         figure.suptitle(title)
+        figure.canvas.draw()  # places the panels; names are laid out in pixels
+        figure.set_layout_engine("none")
+        for axis, panel in zip(axes.flat, panels, strict=False):
+            _name_marks(axis, [mark for mark in panel.marks if mark.is_named])
         stream = io.BytesIO()
         # Without a date; the program's version stays out of PNG as well.
         metadata: dict[str, Any] = {"Date": None} if form == "svg" else {"Software": None}
@@ -145,21 +158,41 @@ def _draw(axis: Any, panel: Panel, looks: dict[str, tuple[str, str]]) -> None:
         each.set_major_formatter(StrMethodFormatter("{x:g}"))
         each.set_minor_formatter(NullFormatter())
     axis.grid(alpha=0.25)
-    _name_marks(axis, [mark for mark in panel.marks if mark.is_named])
 
 
 def _name_marks(axis: Any, marks: Sequence[Mark]) -> None:
-    """Write names beside points, turn by turn on either side of the point."""
-    for number, mark in enumerate(sorted(marks, key=lambda mark: mark.x)):
-        is_above = number % 2 == 0
-        axis.annotate(
-            mark.name,
-            (mark.x, mark.y),
-            xytext=(-3 if is_above else 4, 6 if is_above else -11),
-            textcoords="offset points",
-            ha="right" if is_above else "left",
-            fontsize=7,
-        )
+    """Write names beside points where there is room; one that finds none is left out."""
+    taken: list[tuple[float, float, float, float]] = []
+    to_pixels = axis.transData.transform
+    frame = axis.get_window_extent()
+    for mark in marks:
+        x, y = to_pixels((mark.x, mark.y))
+        width = len(mark.name) * LETTER_PX
+        for right, up in PLACES:
+            left = x + (right if right > 0 else right - width)
+            box = (left, y + up, left + width, y + up + LINE_PX)
+            inside = (
+                frame.x0 <= box[0] and box[2] <= frame.x1 + 4 * LETTER_PX and box[1] >= frame.y0
+            )
+            if inside and not any(_overlap(box, other) for other in taken):
+                taken.append(box)
+                # In points: SVG counts other pixels than PNG.
+                offset = (POINTS_PER_PIXEL * (left - x), POINTS_PER_PIXEL * up)
+                axis.annotate(
+                    mark.name,
+                    (mark.x, mark.y),
+                    xytext=offset,
+                    textcoords="offset points",
+                    fontsize=NAME_POINTS,
+                )
+                break
+
+
+def _overlap(
+    one: tuple[float, float, float, float], other: tuple[float, float, float, float]
+) -> bool:
+    """Whether two boxes (left, bottom, right, top) share an area."""
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
 
 
 def front_line(
