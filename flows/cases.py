@@ -130,6 +130,16 @@ class CaseProcess:
         self._work.cleanup()
 
 
+def outcome_of(process: CaseProcess) -> dict[str, Any]:
+    """Wait for a process; it does not run on where the caller stops."""
+    try:
+        while (result := process.result()) is None:
+            time.sleep(POLL_S)
+        return result
+    finally:
+        process.end()
+
+
 def run_cases(
     cases: Sequence[CaseT], start: Callable[[CaseT], CaseProcess], jobs: int = 1
 ) -> Iterator[tuple[CaseT, dict[str, Any]]]:

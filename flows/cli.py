@@ -9,12 +9,13 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from flows.batch_options import batch_options
 from flows.chart_options import chart_options
 from flows.data_options import data_options
+from flows.evaluate_options import evaluate_options
 from flows.model_options import model_options
 from flows.operator_options import (
     ON_END,
@@ -49,6 +50,7 @@ DOERS = {
     "store": "flows.store",
     "stability": "flows.stability",
     "chart": "flows.chart",
+    "evaluate": "flows.evaluate",
 }
 
 # Thread pools that spin while they wait starve each other: two of them on two cores made the
@@ -116,9 +118,20 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="where artifacts are kept (%(default)s)",
     )
-    job, hooks = job_options(), hook_options()
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
-    for name, parents, purpose in (
+    for name, parents, purpose in _commands(shared):
+        commands.add_parser(
+            name, parents=parents, help=purpose, description=purpose[0].upper() + purpose[1:] + "."
+        )
+    return parser
+
+
+def _commands(
+    shared: argparse.ArgumentParser,
+) -> Iterator[tuple[str, list[argparse.ArgumentParser], str]]:
+    """Each command with the parsers of its options and what it is for."""
+    job, hooks = job_options(), hook_options()
+    yield from (
         ("run", [job, hooks, shared], "make the asset; finished stages are taken from the store"),
         ("batch", [batch_options(), hooks, shared], "make the assets of many inputs"),
         (
@@ -151,13 +164,14 @@ def _parser() -> argparse.ArgumentParser:
             [chart_options(), shared],
             "measure what settings cost and give, and draw their front",
         ),
+        (
+            "evaluate",
+            [evaluate_options(), shared],
+            "score assets of a benchmark's objects against the truth",
+        ),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
-    ):
-        commands.add_parser(
-            name, parents=parents, help=purpose, description=purpose[0].upper() + purpose[1:] + "."
-        )
-    return parser
+    )
 
 
 class _Version(argparse.Action):

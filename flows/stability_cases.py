@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from flows.cases import CaseProcess, run_cases
+from flows.cases import CaseProcess, outcome_of
 from flows.config import PipelineConfig, load_config
 from flows.pipeline import IMAGE_TO_ASSET
 from flows.stability_options import TINY
@@ -124,5 +124,4 @@ def run_case(case: Case, settings: Settings) -> dict[str, Any]:
         "views": settings.views,
         "store": str(settings.store.resolve()),
     }
-    started = run_cases([case], lambda _: CaseProcess(CASE_MODULE, request, settings.limit_s))
-    return next(result for _, result in started)
+    return outcome_of(CaseProcess(CASE_MODULE, request, settings.limit_s))

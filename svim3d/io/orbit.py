@@ -5,7 +5,8 @@ each frame names a multi-channel half-float EXR. Radiance (`R G B`) is premultip
 coverage `A`; basecolor, roughness, metallic and the world normal are straight. Depth and a
 confidence may be there or not. Two layouts are read: `frames` with `reference` as an index (what
 `write_orbit` makes), and the layout of benchmark sets: `train`, and `test` whose frames name one
-file per environment.
+file per environment, or for some environments only. `cameras` may hold a camera by split where one
+differs from the others'.
 """
 
 import contextlib
@@ -109,7 +110,7 @@ def read_orbit(
     with _telling_of(folder):
         index = _read_index(folder)
         frames = _frames(folder, index, split)
-        cameras = _cameras(folder, index, frames)
+        cameras = _cameras(folder, _of_split(index, split), frames)
         reference = _reference(index, len(frames), split)
     names = [frame["file"] for frame in frames]
     images = _read_views([folder / name for name in names], cameras, wanted)
@@ -181,11 +182,19 @@ def _read_index(folder: Path) -> dict[str, Any]:
     return index
 
 
+def _of_split(index: dict[str, Any], split: str) -> dict[str, Any]:
+    """An index whose `camera` is that of a split."""
+    return index | {"camera": index.get("cameras", {}).get(split, index.get("camera", {}))}
+
+
 def _frames(folder: Path, index: dict[str, Any], split: str) -> list[dict[str, Any]]:
     """Frames of a split, each with its `file` and `c2w`."""
     name, _, environment = split.partition("_")
     key = "frames" if name == "train" and "frames" in index else name
     listed = index.get(key)
+    if environment and listed:
+        # Benchmarks may light each test view otherwise; of none it is an error below.
+        listed = [f for f in listed if environment in f.get("files", {})] or listed
     if not listed:
         raise ValueError(
             f"wanted frames in {folder / INDEX}, but the list '{key}' is empty or missing; "

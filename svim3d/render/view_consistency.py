@@ -111,10 +111,11 @@ def correspond(
     back = torch.linalg.inv(cameras.c2w[other].double())
     seen = points @ back[:3, :3].T + back[:3, 3]
     distance = -seen[:, 2]
+    # A point behind the other camera lands somewhere; no depth there is negative as its own is.
     ahead = distance.clamp_min(NEAR)
     column = 0.5 * cameras.width + cameras.focal_px * seen[:, 0] / ahead
     row = 0.5 * cameras.height - cameras.focal_px * seen[:, 1] / ahead
-    inside = (distance > NEAR) & _within(column, cameras.width) & _within(row, cameras.height)
+    inside = _within(column, cameras.width) & _within(row, cameras.height)
     pixels, column, row, distance = (x[inside] for x in (pixels, column, row, distance))
     met = _sample(depth[other].double(), column, row)[:, 0]
     covered = _sample(mask[other].double(), column, row)[:, 0]

@@ -74,6 +74,12 @@ def test_settings_are_no_code_and_the_library_is():
     assert not any(name.startswith("stages.settings") for name in code_digests("stages.generation"))
 
 
+def test_what_only_tables_measure_by_makes_no_artifact_anew():
+    reached = {name for name in code_digests("stages.dmtet") if name.startswith("svim3d.metrics.")}
+    names = ("directions", "pictures", "surface_search", "volumes")
+    assert reached == {f"svim3d.metrics.{name}" for name in names}
+
+
 def test_missing_module_is_named():
     with pytest.raises(ModuleNotFoundError, match=r"stages\.juggling"):
         code_digests("stages.juggling")

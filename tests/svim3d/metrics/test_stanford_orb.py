@@ -164,6 +164,26 @@ def test_black_prediction_stays_black():
     assert found["psnr_ldr_db"] == pytest.approx(-10 * math.log10(floor), rel=1e-9)
 
 
+def test_nearly_black_channels_are_scaled_as_if_they_were_one():
+    truth, faint = draw(0, 0.1), 3e-5
+    found = compare(np.full_like(truth, faint), truth, disc(), scaled=True).rows["foreground"]
+    g = truth[erode(disc())]
+    squared = ((srgb(faint * g.mean(0)) - srgb(g)) ** 2).mean()
+    floor = ((0.5 - srgb(g)) ** 2).mean()
+    assert found["psnr_ldr_db"] == pytest.approx(-10 * math.log10(min(squared, floor)), rel=1e-9)
+    assert squared < floor
+
+
+def test_negative_truth_counts_as_black():
+    truth = draw(0, 0.1)
+    truth[11, 6] = 0.0
+    spoilt = truth.copy()
+    spoilt[11, 6] = -5.0
+    prediction = draw(1, 0.1)
+    expected = compare(prediction, truth, disc(), scaled=True)
+    assert compare(prediction, spoilt, disc(), scaled=True) == expected
+
+
 @pytest.mark.parametrize("bad", [-0.1, math.nan, math.inf])
 def test_impossible_radiance_is_refused(bad):
     truth = draw(0)
@@ -226,15 +246,16 @@ def test_captures_count_alike_however_many_pictures_they_have():
     fine = compare_pictures(p + 0.05, p, m, scaled=True)
     poor = compare_pictures(q, p, m, scaled=True)
     lost = compare_pictures(None, p, m, scaled=True)
-    one = score_capture("one", [fine, fine, poor])
+    one = score_capture("one", [fine, fine, poor, lost])
     two = score_capture("two", [lost])
     table = score_benchmark([one, two])
     values = [c.rows["official"]["psnr_hdr_db"] for c in (one, two)]
     told = table.rows["official"]["psnr_hdr_db"]
     assert told.mean == pytest.approx(np.mean(values))
     assert told.std == pytest.approx(np.std(values))
-    assert (told.worst, told.worst_capture) == (values[1], "two")
-    assert (table.pictures, table.missing, table.failed_captures) == (4, 1, ("two",))
+    assert told.worst == min(values)
+    assert told.worst_capture == ("one", "two")[int(np.argmin(values))]
+    assert (table.pictures, table.missing, table.failed_captures) == (5, 2, ("two",))
 
 
 def test_spread_tells_the_bad_side():

@@ -86,6 +86,18 @@ def test_what_the_other_view_cannot_see_is_not_compared():
     assert found.share == pytest.approx((SIZE - margin - shadow) / SIZE, abs=4.0 / SIZE)
 
 
+def test_pixels_that_are_masked_out_are_not_compared():
+    cameras = side_by_side(0.0, 0.3)
+    depth, mask = mesh_depth(*wall(0.0, -9.0, 9.0), cameras)
+    mask[1, :, : SIZE // 2] = False
+    found = correspond(depth, mask, cameras, 0, 1)
+    assert len(found.pixels)
+    # All four pixels around the place are to be of the object.
+    assert float(found.column.min()) >= SIZE // 2 + 0.5
+    mask[1] = False
+    assert not len(correspond(depth, mask, cameras, 0, 1).pixels)
+
+
 def test_true_views_of_a_painted_sphere_agree():
     cameras = orbit_cameras(
         [(10.0, 24.0 * i) for i in range(15)], radius=2.0, fov_y_deg=FOV_DEG, size=SIZE
