@@ -166,7 +166,7 @@ def _name_marks(axis: Any, marks: Sequence[Mark]) -> None:
     to_pixels = axis.transData.transform
     frame = axis.get_window_extent()
     for mark in marks:
-        x, y = to_pixels((mark.x, mark.y))
+        x, y = (float(side) for side in to_pixels((mark.x, mark.y)))
         width = len(mark.name) * LETTER_PX
         for right, up in PLACES:
             left = x + (right if right > 0 else right - width)
