@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_serializer
 
 from stages.errors import InputError
 from stages.settings.capacity import CapacityConfig
@@ -36,6 +36,11 @@ class RunConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     skip: frozenset[str] = Field(frozenset(), description="stages to leave out")
+
+    @field_serializer("skip", when_used="json")
+    def _in_order(self, skip: frozenset[str]) -> list[str]:
+        """A set's own order changes from process to process, and keys of cases are made of it."""
+        return sorted(skip)
 
 
 class PipelineConfig(RunConfig):

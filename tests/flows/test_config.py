@@ -119,6 +119,13 @@ def test_differences_name_values_of_both_sides():
     assert differences(one, two) == [("a.b", 1, 9), ("d", 3, ...), ("e", ..., 4)]
 
 
+def test_what_is_left_out_is_written_in_order():
+    # Five names, of which a set would be in order by chance once in 120 processes.
+    names = ["uv_bake", "env_preopt", "preview", "dmtet", "capacity"]
+    page = load_config(PipelineConfig, "standard", skip=names).model_dump(mode="json")
+    assert page["skip"] == sorted(names)
+
+
 def test_a_file_of_ones_own_is_a_preset(tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("about: mine\nskip: [dmtet]\nnerf: {steps: 7}\n")
