@@ -2,6 +2,8 @@
 
 import argparse
 import json
+import os
+import platform
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -90,6 +92,8 @@ def _check(options: argparse.Namespace) -> None:
             raise InputError(f"--{name} {getattr(options, name)}: wanted 1 or more")
     if options.size is not None and options.size < 16:
         raise InputError(f"--size {options.size}: wanted 16 pixels or more")
+    if options.size is not None and options.photos:
+        raise InputError("--size is for views, --photos are taken as they are; drop one of the two")
     for orbit in options.orbit:
         if not (orbit / "orbit.json").is_file():
             raise InputError(
@@ -111,16 +115,16 @@ def _orbits(options: argparse.Namespace) -> dict[str, Path]:
     return {f"invented-{n}": invented_orbit(n, parent, size) for n in range(options.invented)}
 
 
-def _given_px(orbits: Mapping[str, Path], options: argparse.Namespace) -> int:
-    """Longest side of the given views, pixels."""
+def _given_px(orbits: Mapping[str, Path], options: argparse.Namespace) -> int | None:
+    """Longest side of the given views, pixels; None where no orbit tells."""
     sides = [options.size] if options.size else []
     for orbit in orbits.values():
         camera = json.loads((orbit / "orbit.json").read_text()).get("camera", {})
         sides.append(max(int(camera.get("width", 0)), int(camera.get("height", 0))))
-    return min(sides)
+    return min((side for side in sides if side > 0), default=None)
 
 
-def _points(options: argparse.Namespace, given_px: int) -> list[Point]:
+def _points(options: argparse.Namespace, given_px: int | None) -> list[Point]:
     presets = list(QUICK_PRESETS) if options.quick else options.presets
     scales = options.scales if options.scales is not None else () if options.quick else SCALES
     return points_of(
@@ -172,7 +176,7 @@ def _measure(
     cases += [Case(points[0].name, orbit, seed) for seed in repeats for orbit in bench.orbits]
     kept = Results[Case](options.output, any_code=options.keep)
     keys = {case: bench.key(by_name[case.point], case) for case in cases}
-    known = {case: kept.get(case, keys[case]) for case in cases}
+    known = {case: _settled(kept.get(case, keys[case])) for case in cases}
     waiting = [case for case in cases if known[case] is None]
     console.print(f"{len(cases)} cases, {len(cases) - len(waiting)} known", highlight=False)
     for case, result in known.items():
@@ -193,6 +197,12 @@ def _measure(
             soft_wrap=True,
         )
         yield case, kept.put(case, keys[case], result)
+
+
+def _settled(result: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """A result that another try would not change: memory and time may suffice the next time."""
+    is_passing = result is not None and result["outcome"] in (Outcome.CRASHED, Outcome.TOO_LONG)
+    return None if is_passing else result
 
 
 def _warm_up(bench: Bench, console: Console) -> None:
@@ -218,6 +228,7 @@ def _told(options: argparse.Namespace, bench: Bench) -> list[str]:
         f"`svim3d chart`: {start}{size} of {', '.join(bench.orbits)}; base `{options.base}`, one "
         "knob turned at a time. CPU seconds are those of the stages, kernels compiled; figures are "
         "taken at cameras that were not given, relighting under two lights that no view shows.",
+        f"{time.strftime('%Y-%m-%d')}, {os.cpu_count()} cores, {platform.platform()}.",
     ]
 
 

@@ -138,6 +138,10 @@ def test_a_point_that_fails_is_listed_and_the_rest_goes_on(tmp_path, capsys, ran
     assert "failed: `texture 2048`: cup: crashed (OSError: disk full)" in capsys.readouterr().out
     rows = list(csv.DictReader((tmp_path / "out" / "chart.csv").open()))
     assert {row["point"] for row in rows} == {"preview", "texture 256", "texture 512"}
+    # It is tried once more: the disk may have room by then.
+    ran.clear()
+    assert main(wanted) == 1
+    assert [case.name for case in ran] == ["texture 2048, cup"]
 
 
 def test_points_are_listed_without_running_any(tmp_path, capsys, ran):
@@ -154,6 +158,7 @@ def test_points_are_listed_without_running_any(tmp_path, capsys, ran):
         (["--knobs", "rays:7"], "rays has no value 7; it has 1024, 2048"),
         (["--base", "quick"], "preset 'quick' is unknown"),
         (["--jobs", "0"], "--jobs 0: wanted 1 or more"),
+        (["--size", "64", "--photos"], "drop one of the two"),
         (["--size", "4"], "--size 4: wanted 16 pixels or more"),
         (["--set", "nerf.stops=3"], "no such setting"),
     ],
