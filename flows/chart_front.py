@@ -57,7 +57,7 @@ class Axis:
 
     def change(self, badness: float) -> float:
         """A difference of two values as a person reads it: in its unit, or as a share."""
-        laid = -badness if self.more_is_better else badness
+        laid = 0.0 - badness if self.more_is_better else badness  # nothing is +0, not -0
         return math.expm1(laid) if self.is_ratio else laid
 
 

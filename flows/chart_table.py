@@ -217,12 +217,15 @@ def markdown(summary: Summary, rows: Sequence[Mapping[str, Any]], told: Iterable
     )
     if summary.base in summary.figures:
         noise = ", ".join(
-            f"{axis.title} {_shown_noise(axis, summary.noise[axis.name])}" for axis in COMPARED
+            f"{axis.title} {_shown_noise(axis, summary.noise[axis.name])}"
+            for axis in COMPARED
+            if summary.noise[axis.name] > 0.0
         )
+        repeats = f"What repeats differ by: {noise}." if noise else "The base was not repeated."
         lines += [
             "",
             f"Paired differences to `{summary.base}`: means over orbits, with intervals of 95 % "
-            f"(bootstrap over orbits). What repeats differ by: {noise}.",
+            f"(bootstrap over orbits). {repeats}",
             "",
             *_table(
                 changes,

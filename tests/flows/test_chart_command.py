@@ -98,6 +98,9 @@ def test_points_are_measured_drawn_and_named(tmp_path, capsys, ran, monkeypatch)
     page = (out / "chart.md").read_text()
     assert "dominated in all figures at once: `rays 8192`, by `rays 1024`" in page
     assert "+3.00 [+3.00, +3.00]" in page
+    # Two seeds, 1 % of time apart: three standard errors of a mean of two differences.
+    assert "What repeats differ by: CPU s 2.1%." in page
+    assert "| preview | +0% [+0%, +0%] | +0.00 [+0.00, +0.00] |" in page
     with (out / "cases.csv").open() as stream:
         assert len(list(csv.DictReader(stream))) == len(ran)
     assert "chart.html: 8 points" in capsys.readouterr().out
