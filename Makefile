@@ -21,4 +21,4 @@ check:
 	$(PYTHON) -m pytest -m 'not slow and not gpu and not browser'
 
 bench:
-	$(PYTHON) benchmarks/bench_pipeline.py
+	$(PYTHON) -m flows.cli chart $(wildcard $(SVIM3D_DATA)/orbits/*)

@@ -5,19 +5,14 @@ import tempfile
 from dataclasses import asdict
 from pathlib import Path
 
-from torch import Tensor
-
 from stages.artifacts import MaterialViews
+from stages.given_views import shrunken
 from stages.keys import code_digests, digest_file, digest_json
-from svim3d.cameras import Cameras
 from svim3d.io.image import write_png
 from svim3d.io.orbit import read_orbit, write_orbit
 from svim3d.io.orbit_sheet import orbit_sheet
-from svim3d.numerics import normalize
 from svim3d.synthesis import inconsistency
 from svim3d.synthesis.inconsistency import Strengths, make_inconsistent
-
-MIN_COVERAGE = 1e-3  # below it a pixel holds no colour that could be divided out
 
 
 def corrupted_orbit(
@@ -50,25 +45,3 @@ def corrupted_orbit(
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return folder
-
-
-def shrunken(views: MaterialViews, size: int) -> tuple[Cameras, dict[str, Tensor]]:
-    """Area means of at most `size` pixels, straight but for radiance.
-
-    Views that fit keep every bit.
-    """
-    images = {name: value for name, value in vars(views).items() if isinstance(value, Tensor)}
-    if max(views.cameras.height, views.cameras.width) <= size:
-        return views.cameras, images
-    cameras, planes = views.premultiplied(size)
-    covered = planes["mask"] > MIN_COVERAGE
-    mask = planes["mask"] * covered
-    straight = {
-        name: plane * covered / planes["mask"].clamp_min(MIN_COVERAGE)
-        for name, plane in planes.items()
-    }
-    return cameras, straight | {
-        "mask": mask,
-        "radiance": planes["radiance"] * covered,
-        "normal_world": normalize(straight["normal_world"]),
-    }

@@ -1,12 +1,10 @@
-"""One case of the pipeline benchmark, in a process of its own: all stages, then the figures.
+"""A case of the pipeline in this process: all stages up to the export, then the figures.
 
 The stages run through the real store, without the flow engine: what a stored artifact cost is read
 from its manifest, so that an interrupted benchmark goes on where it stopped and stages that two
 cases share run once.
 """
 
-import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -80,26 +78,3 @@ def measure(plan: Plan, store: Store, truth: Path) -> dict[str, Any]:
         "events": {name: record["events"] for name, record in records.items()},
         "figures": figures,
     }
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("orbit", type=Path)
-    parser.add_argument("--preset", required=True)
-    parser.add_argument("--set", action="append", default=[], dest="overrides")
-    parser.add_argument("--skip", action="append", default=[])
-    parser.add_argument("--store", type=Path, required=True)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, required=True, help="JSON file for the result")
-    given = parser.parse_args()
-    store = Store(given.store)
-    plan = plan_case(
-        given.orbit, given.preset, given.overrides, given.skip, store=store, seed=given.seed
-    )
-    result = measure(plan, store, given.orbit)
-    given.out.parent.mkdir(parents=True, exist_ok=True)
-    given.out.write_text(json.dumps(result, indent=1))
-
-
-if __name__ == "__main__":
-    main()

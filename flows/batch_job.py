@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flows.config import RunConfig, load_config
+from flows.config import RunConfig, load_config, resolved_preset
 from flows.pipeline import Pipeline
 from flows.plan import Plan, Selection, Step, make_plan
 from flows.recording import Audience, RunRecorder
@@ -69,7 +69,14 @@ class BatchJob:
         """Arguments of `svim3d` that make this one input alone."""
         return (
             *("run", str(self.source.resolve()), "-o", str(self.out.resolve())),
-            *("--preset", self.preset, "--seed", str(self.seed), "--device", self.device),
+            *(
+                "--preset",
+                resolved_preset(self.preset),
+                "--seed",
+                str(self.seed),
+                "--device",
+                self.device,
+            ),
             *(f"--set={override}" for override in self.overrides),
             *(f"--skip={stage}" for stage in sorted(self.skip)),
             *(f"--timeout={stage}={limit}" for stage, limit in self.limits_s.items()),

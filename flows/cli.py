@@ -9,9 +9,10 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from flows.batch_options import batch_options
+from flows.chart_options import chart_options
 from flows.data_options import data_options
 from flows.evaluate_options import evaluate_options
 from flows.model_options import model_options
@@ -54,6 +55,7 @@ DOERS = {
     "logs": "flows.runs",
     "store": "flows.store",
     "stability": "flows.stability",
+    "chart": "flows.chart",
     "evaluate": "flows.evaluate",
     "report": "flows.report.command",
     "view": "flows.view",
@@ -115,9 +117,21 @@ def _parser() -> argparse.ArgumentParser:
         prog="svim3d", description="A photo or views of an object in, a relightable 3D asset out."
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
-    job, hooks, shared = job_options(), hook_options(), shared_options()
+    shared = shared_options()
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
-    for name, parents, purpose in (
+    for name, parents, purpose in _commands(shared):
+        commands.add_parser(
+            name, parents=parents, help=purpose, description=purpose[0].upper() + purpose[1:] + "."
+        )
+    return parser
+
+
+def _commands(
+    shared: argparse.ArgumentParser,
+) -> Iterator[tuple[str, list[argparse.ArgumentParser], str]]:
+    """Each command with the parsers of its options and what it is for."""
+    job, hooks = job_options(), hook_options()
+    yield from (
         ("run", [job, hooks, shared], "make the asset; finished stages are taken from the store"),
         ("batch", [batch_options(), hooks, shared], "make the assets of many inputs"),
         (
@@ -149,17 +163,18 @@ def _parser() -> argparse.ArgumentParser:
         ("automations", [shared], "let a Prefect server find and resume runs that were killed"),
         ("stability", [stability_options(), shared], "run the suite of hazards, and report"),
         (
+            "chart",
+            [chart_options(), shared],
+            "measure what settings cost and give, and draw their front",
+        ),
+        (
             "evaluate",
             [evaluate_options(), shared],
             "score assets of a benchmark's objects against the truth",
         ),
         ("presets", [shared], "list the presets: their steps and what they leave out"),
         ("doctor", [shared], "describe this machine, the installation and the store"),
-    ):
-        commands.add_parser(
-            name, parents=parents, help=purpose, description=purpose[0].upper() + purpose[1:] + "."
-        )
-    return parser
+    )
 
 
 class _Version(argparse.Action):

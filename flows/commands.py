@@ -9,7 +9,7 @@ from typing import Self
 from rich.console import Console
 from rich.table import Table
 
-from flows.config import PRESETS, PipelineConfig, load_config, preset_about
+from flows.config import PRESETS, PipelineConfig, load_config, preset_about, resolved_preset
 from flows.console import plan_table
 from flows.job import DONE, Job, compute_under_engine
 from flows.limits import parse_limits
@@ -85,6 +85,7 @@ class Request:
     def command(self) -> tuple[str, ...]:
         """Arguments of `svim3d` that ask for the same; relative paths in overrides stay so."""
         source = self.source if self.source in SHIPPED else str(self.path.resolve())
+        preset = resolved_preset(self.preset)
         lists = {
             "--set": self.overrides,
             "--skip": sorted(self.skip),
@@ -96,7 +97,7 @@ class Request:
             "--share": [self.share],
         }
         return (
-            *("run", source, "-o", str(self.run_folder.resolve()), "--preset", self.preset),
+            *("run", source, "-o", str(self.run_folder.resolve()), "--preset", preset),
             *(f"{option}={value}" for option, values in lists.items() for value in values if value),
             *("--seed", str(self.seed), "--device", self.device),
             *("--store", str(self.store.resolve())),

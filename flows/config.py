@@ -6,10 +6,11 @@ import difflib
 import importlib.resources
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_serializer
 
 from stages.errors import InputError
 from stages.settings.capacity import CapacityConfig
@@ -24,6 +25,7 @@ from stages.settings.relight import RelightConfig
 from stages.settings.uv_bake import UvBakeConfig
 
 PRESETS = ("preview", "standard", "paper", "auto")  # from quick to thorough, and what is needed
+PRESET_SUFFIXES = (".yaml", ".yml")  # what ends so is a file of one's own
 ABOUT = "about"  # the one key of a preset file that is no setting: a line for `svim3d presets`
 NEAREST_NAMES = 3
 
@@ -34,6 +36,11 @@ class RunConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     skip: frozenset[str] = Field(frozenset(), description="stages to leave out")
+
+    @field_serializer("skip", when_used="json")
+    def _in_order(self, skip: frozenset[str]) -> list[str]:
+        """A set's own order changes from process to process, and keys of cases are made of it."""
+        return sorted(skip)
 
 
 class PipelineConfig(RunConfig):
@@ -71,7 +78,7 @@ def load_config(
 
     Args:
         schema: the settings of a pipeline.
-        preset: name of a file in `configs`.
+        preset: name of a file in `configs`, or path of a file like those.
         overrides: as given to `--set`; values are YAML.
         skip: stages to leave out beside those that the preset leaves out.
 
@@ -124,11 +131,41 @@ def preset_about(preset: str) -> str:
 
 
 def _read_preset(preset: str) -> dict[str, Any]:
+    if is_preset_file(preset):
+        return _read_preset_file(Path(preset))
     if preset not in PRESETS:
-        raise InputError(f"preset {preset!r} is unknown; choose one of {', '.join(PRESETS)}")
+        raise InputError(
+            f"preset {preset!r} is unknown; choose one of {', '.join(PRESETS)}, or give a .yaml "
+            "file"
+        )
     file = importlib.resources.files("configs") / f"{preset}.yaml"
     values: dict[str, Any] = yaml.safe_load(file.read_text()) or {}
     return values
+
+
+def is_preset_file(preset: str) -> bool:
+    """Whether a preset is a file of one's own, not one of ours by name."""
+    return preset.endswith(PRESET_SUFFIXES)
+
+
+def resolved_preset(preset: str) -> str:
+    """The same preset for a command that starts in another folder."""
+    return str(Path(preset).resolve()) if is_preset_file(preset) else preset
+
+
+def _read_preset_file(file: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(file.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"preset {file} cannot be read: {error}; check the path") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"preset {file} is no YAML: {error}") from error
+    if not isinstance(values, dict | None):
+        raise InputError(
+            f"wanted settings by stage in preset {file}, like 'nerf: {{steps: 400}}', got a "
+            f"{type(values).__name__}"
+        )
+    return values or {}
 
 
 def setting_names(schema: type[Any]) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from flows.case_process import Outcome
+from flows.cases import Outcome
 from flows.evaluate_cases import (
     Row,
     Subject,

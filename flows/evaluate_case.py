@@ -9,8 +9,8 @@ import traceback
 from pathlib import Path
 from typing import Any
 
+from flows.case_work import CLEAR, Listener
 from flows.evaluate_cases import LAST_STAGE, VIEWS_STAGE, Case, Row, Subject, plan_case
-from flows.stability_case import CLEAR, Listener
 from flows.steps import Bench, obtain_steps
 from stages.execution import choose_device, run_stage
 from stages.settings.table_scores import TableScoresConfig
@@ -58,7 +58,7 @@ def _score(case: Case, store: Store, device: str, listener: Listener) -> None:
 def main() -> None:
     """Carry out the request in the file that the command line names."""
     request = json.loads(Path(sys.argv[1]).read_text())
-    Path(request["answer"]).write_text(json.dumps({"error": carry_out(request)}))
+    Path(request["out"]).write_text(json.dumps({"error": carry_out(request)}))
 
 
 if __name__ == "__main__":

@@ -6,14 +6,12 @@ killed evaluation goes on where it was.
 
 import json
 import math
-import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flows.case_process import ended
+from flows.cases import CaseProcess, outcome_of
 from flows.config import PipelineConfig, load_config
 from flows.pipeline import IMAGE_TO_ASSET
 from flows.plan import Plan, Selection, make_plan
@@ -240,22 +238,16 @@ def run_case(
     case: Case, *, from_photo: bool, seed: int, device: str, store: Store, limit_s: float
 ) -> str | None:
     """Compute a case in a process of its own; why it failed, if it did."""
-    with tempfile.TemporaryDirectory(prefix="svim3d-evaluate-") as work:
-        request, answer = Path(work) / "request.json", Path(work) / "answer.json"
-        page = {
-            "subject": case.subject.name,
-            "truth": str(case.subject.truth.resolve()),
-            "row": [case.row.name, case.row.preset, case.row.overrides, case.row.skip],
-            "config": case.config.model_dump(mode="json"),
-            "from_photo": from_photo,
-            "seed": seed,
-            "device": device,
-            "store": str(store.root.resolve()),
-            "answer": str(answer),
-        }
-        request.write_text(json.dumps(page))
-        failed = ended([sys.executable, "-m", CASE_MODULE, str(request)], limit_s)
-        if not answer.exists():
-            return f"{failed['outcome']}: {failed['error']}"
-        error: str | None = json.loads(answer.read_text())["error"]
-        return error
+    request = {
+        "subject": case.subject.name,
+        "truth": str(case.subject.truth.resolve()),
+        "row": [case.row.name, case.row.preset, case.row.overrides, case.row.skip],
+        "config": case.config.model_dump(mode="json"),
+        "from_photo": from_photo,
+        "seed": seed,
+        "device": device,
+        "store": str(store.root.resolve()),
+    }
+    found = outcome_of(CaseProcess(CASE_MODULE, request, limit_s))
+    error: str | None = found["error"]
+    return f"{found['outcome']}: {error}" if "outcome" in found else error

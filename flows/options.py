@@ -73,7 +73,9 @@ def add_share(parser: argparse.ArgumentParser) -> None:
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """Preset, single settings, and what is left out."""
     parser.add_argument(
-        "--preset", default="standard", help="preview, standard or paper (%(default)s)"
+        "--preset",
+        default="standard",
+        help="preview, standard, paper, auto, or a .yaml file like those (%(default)s)",
     )
     parser.add_argument(
         "--set",

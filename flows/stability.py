@@ -8,7 +8,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from flows.stability_cases import BASELINE, OURS, Case, Results, Settings, code_digest, run_case
+from flows.cases import Results
+from flows.stability_cases import BASELINE, OURS, Case, Settings, code_digest, run_case
 from flows.stability_report import write_page
 from flows.stability_table import (
     FORBIDDEN,
@@ -149,7 +150,7 @@ def _run(
     cases: Sequence[Case], settings: Settings, options: argparse.Namespace, console: Console
 ) -> dict[Case, dict[str, object]]:
     """Results of all cases, those that are known as they are."""
-    results = Results(options.output, any_code=options.keep)
+    results = Results[Case](options.output, any_code=options.keep)
     code = code_digest()
     found = {}
     for number, case in enumerate(cases, 1):

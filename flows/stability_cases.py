@@ -1,21 +1,15 @@
-"""Cases of the stability suite: what is run, by which settings, and what is known already."""
+"""Cases of the stability suite: what is run, and by which settings."""
 
-import json
-import sys
-import tempfile
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from flows.case_process import Outcome as Outcome
-from flows.case_process import ended
+from flows.cases import CaseProcess, outcome_of
 from flows.config import PipelineConfig, load_config
 from flows.pipeline import IMAGE_TO_ASSET
 from flows.stability_options import TINY
 from stages.keys import code_digests, digest_json, library_versions
 
-RESULTS = "results.jsonl"
 CASE_MODULE, TRIAL_MODULE = "flows.stability_case", "stages.hazard_trial"
 
 # About eight CPU seconds a case with all phases, of which two are the start of the process.
@@ -119,66 +113,15 @@ def code_digest() -> str:
     return digest_json({"code": digests, "versions": library_versions()})
 
 
-class Results:
-    """A line of JSON for each case that was run; a killed suite goes on where it was.
-
-    Args:
-        folder: of `results.jsonl`, made if it is not there.
-        any_code: whether results of other code and settings are taken, too.
-    """
-
-    def __init__(self, folder: Path, *, any_code: bool = False) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._file = folder / RESULTS
-        self._any_code = any_code
-        self._known: dict[str, dict[str, Any]] = {}
-        for line in self._lines():
-            self._known[line["key"]] = line
-            if any_code:
-                self._known[digest_json(line["case"])] = line
-
-    def _lines(self) -> Iterable[dict[str, Any]]:
-        if not self._file.exists():
-            return
-        for line in self._file.read_text().splitlines():
-            try:
-                page = json.loads(line)
-            except json.JSONDecodeError:
-                continue  # cut off when the suite was killed
-            if isinstance(page, dict) and {"key", "case"} <= page.keys():
-                yield page
-
-    def get(self, case: Case, key: str) -> dict[str, Any] | None:
-        """What is known of a case."""
-        other = self._known.get(digest_json(asdict(case))) if self._any_code else None
-        return self._known.get(key, other)
-
-    def put(self, case: Case, key: str, result: dict[str, Any]) -> dict[str, Any]:
-        """Keep a result."""
-        line = {"key": key, "case": asdict(case), **result}
-        self._known[key] = line
-        with self._file.open("a") as stream:
-            # Begun anew, in case the last line was cut.
-            stream.write("\n" + json.dumps(line) + "\n")
-        return line
-
-
 def run_case(case: Case, settings: Settings) -> dict[str, Any]:
     """Run a case in a process of its own; how it ended, and what it found."""
     preset, overrides = settings.of(case)
-    with tempfile.TemporaryDirectory(prefix="svim3d-stability-") as work:
-        out = Path(work) / "result.json"
-        request = {
-            "case": asdict(case),
-            "preset": preset,
-            "overrides": overrides,
-            "size": settings.size,
-            "views": settings.views,
-            "store": str(settings.store.resolve()),
-            "work": work,
-            "out": str(out),
-        }
-        file = Path(work) / "request.json"
-        file.write_text(json.dumps(request))
-        failed = ended([sys.executable, "-m", CASE_MODULE, str(file)], settings.limit_s)
-        return json.loads(out.read_text()) if out.exists() else failed
+    request = {
+        "case": asdict(case),
+        "preset": preset,
+        "overrides": overrides,
+        "size": settings.size,
+        "views": settings.views,
+        "store": str(settings.store.resolve()),
+    }
+    return outcome_of(CaseProcess(CASE_MODULE, request, settings.limit_s))

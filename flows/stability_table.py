@@ -8,7 +8,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from flows.stability_cases import BASELINE, OURS, Case, Outcome
+from flows.cases import Outcome
+from flows.stability_cases import BASELINE, OURS, Case
 from flows.stability_figures import breakdown, quantile, wilson, worst_tenth
 
 TOLERATED_DB = 3.0  # below the same object without its hazard; more is a failure

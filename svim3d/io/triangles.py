@@ -24,3 +24,8 @@ def read_triangles(file: Path) -> tuple[Float[Tensor, "N 3"], Int[Tensor, "F 3"]
         torch.from_numpy(np.array(loaded.vertices, np.float32)),
         torch.from_numpy(np.array(loaded.faces, np.int32)),
     )
+
+
+def write_triangles(file: Path, vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> None:
+    """Write a mesh of bare triangles; the file's ending names the format, like .ply."""
+    trimesh.Trimesh(vertices.cpu().numpy(), faces.cpu().numpy(), process=False).export(file)

@@ -5,8 +5,10 @@ import json
 import pytest
 
 from benchmarks.bench_capacity import foreseen, parse, row, scaled, table
-from benchmarks.capacity_scenes import SIMPLE, TEST_VIEWS, VIEWS, scene_orbit
+from benchmarks.capacity_scenes import SIMPLE, scene_orbit
 from flows.config import PipelineConfig, load_config
+from stages.given_views import photo_of
+from stages.invented_orbit import TEST_VIEWS, VIEWS
 from svim3d.io.orbit import read_orbit
 
 
@@ -81,6 +83,8 @@ def test_a_procedural_scene_is_an_orbit_with_all_that_figures_need(tmp_path):
     names = json.loads((truth / "orbit.json").read_text())["environments"]
     assert all((truth / entry["file"]).is_file() for entry in names.values())
     assert (truth / "mesh.ply").is_file()
+    photo, (override,) = photo_of(truth)
+    assert photo.is_file() and override.startswith("generation.elevation_deg=")
 
 
 def test_scenes_without_a_data_folder_are_the_invented_ones(monkeypatch):

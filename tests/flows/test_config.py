@@ -11,7 +11,9 @@ from flows.config import (
     RunConfig,
     differences,
     load_config,
+    preset_about,
     preset_values,
+    resolved_preset,
     setting_names,
 )
 from flows.pipeline import IMAGE_TO_ASSET
@@ -115,3 +117,39 @@ def test_setting_names_are_dotted():
 def test_differences_name_values_of_both_sides():
     one, two = {"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 9, "c": 2}, "e": 4}
     assert differences(one, two) == [("a.b", 1, 9), ("d", 3, ...), ("e", ..., 4)]
+
+
+def test_what_is_left_out_is_written_in_order():
+    # Five names, of which a set would be in order by chance once in 120 processes.
+    names = ["uv_bake", "env_preopt", "preview", "dmtet", "capacity"]
+    page = load_config(PipelineConfig, "standard", skip=names).model_dump(mode="json")
+    assert page["skip"] == sorted(names)
+
+
+def test_a_file_of_ones_own_is_a_preset(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("about: mine\nskip: [dmtet]\nnerf: {steps: 7}\n")
+    config = load_config(PipelineConfig, str(file), ["nerf.hidden=8"])
+    assert (config.nerf.steps, config.nerf.hidden, config.skip) == (7, 8, frozenset({"dmtet"}))
+    assert preset_about(str(file)) == "mine"
+    assert resolved_preset(str(file)) == str(file) and resolved_preset("paper") == "paper"
+    empty = tmp_path / "empty.yml"
+    empty.write_text("")
+    assert load_config(PipelineConfig, str(empty)) == PipelineConfig()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "cannot be read"),
+        ("nerf: {", "is no YAML"),
+        ("- nerf", "wanted settings by stage"),
+        ("nerf: {stops: 7}", "nerf.stops: no such setting; did you mean nerf.steps"),
+    ],
+)
+def test_a_preset_file_that_is_none_is_refused(tmp_path, text, said):
+    file = tmp_path / "mine.yaml"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(InputError, match=said):
+        load_config(PipelineConfig, str(file))

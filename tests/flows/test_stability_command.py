@@ -5,8 +5,9 @@ import json
 import pytest
 
 from flows import stability as command
+from flows.cases import Outcome, Results
 from flows.cli import main
-from flows.stability_cases import BASELINE, OURS, Case, Outcome, Results, Settings, run_case
+from flows.stability_cases import BASELINE, OURS, Case, Settings, run_case
 
 SOUND = {
     "outcome": Outcome.ASSET,

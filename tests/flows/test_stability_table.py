@@ -3,7 +3,8 @@ import math
 
 import pytest
 
-from flows.stability_cases import BASELINE, OURS, Case, Outcome
+from flows.cases import Outcome
+from flows.stability_cases import BASELINE, OURS, Case
 from flows.stability_report import write_page
 from flows.stability_table import Verdict, breakdowns, confusion, judge_all, rows_of, write_csv
 
