@@ -36,7 +36,6 @@ DONE, FAILED = 0, 1
 INVENTED_PX = 128  # side of views that are rendered here, unless --size says otherwise
 WRITTEN_EVERY_S = 300.0  # the pages, while cases are run
 QUICK_PRESETS = ("standard",)
-NO_KNOBS = ["none"]
 WARM_UP = Point(
     "warm-up",
     "",
@@ -146,8 +145,6 @@ def chosen_knobs(wanted: Sequence[str] | None, *, is_quick: bool = False) -> lis
     """
     if wanted is None:
         return quick(KNOBS) if is_quick else list(KNOBS)
-    if wanted == NO_KNOBS:
-        return []
     known = {knob.name: knob for knob in KNOBS}
     chosen = []
     for text in wanted:

@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+NONE = "none"  # the word for an empty list
+
 
 def chart_options() -> argparse.ArgumentParser:
     """What is measured, on which objects."""
@@ -72,19 +74,19 @@ def _add_points(options: argparse.ArgumentParser) -> None:
         type=_names,
         default=["preview", "standard", "paper", "auto"],
         metavar="P,P,...",
-        help="measured as they are, beside the base (preview,standard,paper,auto)",
+        help="measured as they are, beside the base (preview,standard,paper,auto), or none",
     )
     points.add_argument(
         "--knobs",
         type=_names,
         metavar="K,K,...",
-        help="by name, or K:V+V for some values of one alone; `none` (all; see --list)",
+        help="by name, or K:V+V for some values of one alone, or none (all; see --list)",
     )
     points.add_argument(
         "--scales",
         type=_numbers,
         metavar="F,F,...",
-        help="factors of all step counts of the base together (0.25,0.5,2,4)",
+        help="factors of all step counts of the base together (0.25,0.5,2,4), or none",
     )
     points.add_argument(
         "--set",
@@ -102,10 +104,15 @@ def _add_points(options: argparse.ArgumentParser) -> None:
 
 
 def _names(text: str) -> list[str]:
-    """Comma-separated words."""
-    return [name.strip() for name in text.split(",") if name.strip()]
+    """Comma-separated words; `none` is the empty list."""
+    return [name.strip() for name in text.split(",") if name.strip() not in ("", NONE)]
 
 
 def _numbers(text: str) -> list[float]:
-    """Comma-separated numbers; argparse tells of a ValueError."""
-    return [float(number) for number in _names(text)]
+    """Comma-separated numbers."""
+    try:
+        return [float(number) for number in _names(text)]
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"wanted numbers like 0.5,2, or none, got {text!r}"
+        ) from error

@@ -1,7 +1,7 @@
 """What `svim3d chart` measures: points (settings) and cases (a point of an orbit)."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -209,10 +209,3 @@ def _effect(point: Point, given_px: int | None) -> str:
                 page[stage]["image_size"] = min(page[stage]["image_size"], given_px)
         size = None if size is not None and size >= given_px else size
     return digest_json({"config": page, "views": point.views, "size": size})
-
-
-def case_page(point: Point) -> dict[str, Any]:
-    """What a reader is told of a point."""
-    page = asdict(point)
-    page["overrides"] = list(point.overrides)
-    return page

@@ -33,5 +33,5 @@ def notes_for(suite: str, table: str) -> list[str]:
     """What is told below a table."""
     if (suite, table) == ("stanford-orb", "stanford-orb"):
         return list(_ORB)
-    told = _PAPER.get(("poly-haven" if suite == "blender-vault" else suite, table))
-    return [told] if told and suite != "blender-vault" else []
+    told = _PAPER.get((suite, table))
+    return [told] if told else []

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import json
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from stages.errors import InputError
 
 WRITERS = ("export", "preview")  # stages that read the finished asset or write it: seconds
 GLB = "glb"
+BOUNDS = ("--until", "--only")  # options that end a run before its asset
 
 
 def export(options: argparse.Namespace) -> int:
@@ -95,9 +97,16 @@ def _require_finished(plan: Plan, record: RunRecord) -> None:
         first = missing[0]
         raise InputError(
             f"wanted a finished run, but {', '.join(s.node.name for s in missing)} of {record.id} "
-            f"are not in the store ({first.node.name}: {first.reason}); carry it out again: "
-            f"svim3d resume {record.id}"
+            f"are not in the store ({first.node.name}: {first.reason}); carry it out again"
+            f"{_how(record)}"
         )
+
+
+def _how(record: RunRecord) -> str:
+    """What brings a run to its end: one that was asked to stop before it would do so again."""
+    if any(word.partition("=")[0] in BOUNDS for word in record.command):
+        return f" without {', '.join(BOUNDS)}: svim3d {shlex.join(record.command)}"
+    return f": svim3d resume {record.id}"
 
 
 def _within(record: RunRecord) -> contextlib.AbstractContextManager[None]:

@@ -91,6 +91,10 @@ def _watch(subject: str, store: Path) -> "Callable[[LiveScene], None]":
         if not file.is_file():
             raise InputError(f"there is no file {file}; check the path")
         return lambda scene: scene.show_file(file)
+    if file.is_file():
+        raise InputError(
+            f"wanted a run or a .glb file, got {file}; svim3d export writes other formats"
+        )
     index = RunIndex(store)
     first = index.find(subject)
 

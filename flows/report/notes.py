@@ -126,6 +126,7 @@ ADVICE: Mapping[str, Advice] = {
     "few_views": _act("There are few views", MORE_VIEWS),
     "cut_off": _act("The object leaves the frame", "Frame it with a margin in every view."),
     "soft_masks": _act("Outlines fade", "They were sharpened about half: give sharper masks."),
+    "no_textures": _chosen("There are no textures to write", "Phase 3 was left out."),
     "background_bleeds": _act(
         "The background shines through along outlines",
         "Colours there are taken from inside. Cut the object out cleanly.",

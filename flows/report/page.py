@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from flows.plan import Verdict
 from flows.report.evidence import RunEvidence
 from flows.report.notes import CAPACITY, WITHOUT, grouped, remedy
 from flows.report.pictures import Pictures
@@ -202,11 +203,15 @@ def _events(evidence: RunEvidence, pictures: Pictures) -> Iterator[tuple[str, st
 
 def _left_out(evidence: RunEvidence) -> list[tuple[str, str]]:
     """Stages without an artifact, and what that means for the asset."""
-    return [
+    left_out = [
         (s.name, WITHOUT[s.name])
         for s in evidence.stages
         if not s.key and s.name in WITHOUT and s.state == "skipped"
     ]
+    unasked = [s.name for s in evidence.stages if s.state == Verdict.NOT_ASKED]
+    if unasked:
+        left_out.append((", ".join(unasked), "not asked for: the run was to end before"))
+    return left_out
 
 
 def _inputs(evidence: RunEvidence, pictures: Pictures) -> list[dict[str, str]]:

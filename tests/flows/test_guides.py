@@ -220,10 +220,24 @@ def test_the_commands_of_a_guide_work(guide, desk, store, engine, monkeypatch):
         assert code == cli.DONE, f"{command}\n{said[-3000:]}"
 
 
+def anchors(guide: Path) -> set[str]:
+    """What headings are linked by."""
+    headings = re.findall(r"^#+ (.+)$", guide.read_text(), re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
 def test_links_of_guides_lead_somewhere():
     for guide in (PROJECT / "README.md", *DOCS.glob("*.md")):
-        for link in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", guide.read_text()):
-            assert (guide.parent / link).exists(), f"{guide.name}: {link}"
+        for link, _, anchor in re.findall(r"\]\(([^)#:\s]*)(#([^)\s]*))?\)", guide.read_text()):
+            target = guide.parent / link if link else guide
+            assert target.exists(), f"{guide.name}: {link}"
+            assert not anchor or anchor in anchors(target), f"{guide.name}: {link}#{anchor}"
+
+
+def test_scripts_that_pages_name_exist():
+    for page in (PROJECT / "README.md", *DOCS.glob("*.md")):
+        for script in re.findall(r"\bbenchmarks/\w+\.py\b", page.read_text()):
+            assert (PROJECT / script).exists(), f"{page.name}: {script}"
 
 
 def test_events_of_the_troubleshooting_page_exist():
