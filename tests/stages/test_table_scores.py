@@ -112,8 +112,12 @@ def test_a_photo_s_asset_is_laid_over_the_truth(truth, tmp_path, ctx):
     assert min(scores_of(scores, "given", "drawn", "basecolor_db")) > 40
     assert min(scores_of(scores, "reference", "drawn", "rgb_db")) > 40
     # Of one colour, so that neighbours agree but for pixels of the rim.
-    assert scores.agreement["apart"] < 0.02
-    assert 0.05 < scores.agreement["compared"] < 1.0
+    for subject in ("drawn", "true views"):
+        figures = scores.agreement[subject]
+        assert figures["apart"] < 0.02
+        # As bright as its basecolor times the light, and encoded by a curve.
+        assert figures["rgb_apart"] < 0.02
+        assert 0.05 < figures["compared"] < 1.0
 
 
 def test_what_was_drawn_at_test_cameras_is_relit(truth, tmp_path, ctx):
