@@ -54,6 +54,26 @@ def evaluate_options() -> argparse.ArgumentParser:
         help="also tell LPIPS, by these weights: the state of lpips.LPIPS(net='alex' or 'vgg')",
     )
     options.add_argument(
+        "--fid",
+        type=Path,
+        metavar="FILE",
+        help="also tell FID of all pictures, by pytorch-fid's pt_inception-2015-12-05",
+    )
+    options.add_argument(
+        "--clip",
+        type=Path,
+        metavar="FOLDER",
+        help="also tell CMMD and CLIP-S, by a CLIPModel as transformers saves it (published CMMD: "
+        "openai/clip-vit-large-patch14-336)",
+    )
+    options.add_argument(
+        "--seeds",
+        type=int,
+        default=1,
+        metavar="N",
+        help="repeat every row with N seeds, from --seed on (%(default)s)",
+    )
+    options.add_argument(
         "--limit",
         type=float,
         default=7200.0,
