@@ -26,7 +26,7 @@ def sets_table(results: Results) -> Table | None:
 
     Rows are compared by the objects that all of them have, so that all sets are of one size.
     """
-    from stages.picture_sets import set_figures
+    from stages.set_figures import set_figures
 
     common = sorted(set.intersection(*(set(pages) for pages in results.values())))
     found: dict[str, dict[str, dict[str, Values]]] = {}  # by row, subject and figure

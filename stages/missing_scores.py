@@ -11,7 +11,7 @@ import torch
 from stages.base import Context, Stage
 from stages.errors import InputError
 from stages.orb_scores import capture_figures, orb_figures
-from stages.picture_networks import read_distance
+from stages.pair_distance import read_distance
 from stages.scores_artifact import ASSET, NOVEL, RELIT, TableScores, ViewScore
 from stages.settings.table_scores import TableScoresConfig
 from stages.truth import SEEN, read_truth

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from stages.pair_distance import LPIPS
 from stages.scores_artifact import NOVEL, RELIT, Figures
 from stages.truth import Truth
 from svim3d.metrics.stanford_orb import (
@@ -22,7 +23,6 @@ from svim3d.metrics.stanford_orb import (
 from svim3d.render.view_figures import COVERED, Perceptual
 
 ORB, ALBEDO, GEOMETRY = "orb", "albedo", "geometry"
-LPIPS = "lpips"
 
 Picture = Mapping[str, Tensor]
 Mesh = tuple[Tensor, Tensor]

@@ -14,14 +14,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.errors import InputError
+from stages.set_figures import CLIP
 from stages.settings.picture_networks import PictureNetworkSettings
 from svim3d.io.picture_networks import Encoder, read_clip, read_efficientnet, read_inception
 from svim3d.io.weights import load_state
 from svim3d.losses.lpips import Lpips
 from svim3d.metrics.features import clip_similarity, cmmd, frechet_distance
-from svim3d.render.view_figures import Perceptual
 
-CLIP = "clip"  # the network that gives `cmmd` and `clip_similarity`
 # Whether more is better, by figure.
 IS_BETTER_HIGH = {
     "lpips": False,
@@ -122,18 +121,6 @@ def read_encoders(
         return {name: read(path, device) for name, path, read in named if path is not None}
     except ValueError as error:
         raise InputError(str(error)) from error
-
-
-def read_distance(weights: Path | None) -> Perceptual | None:
-    """The distance of pairs that a user's weights are of, called by its name.
-
-    Raises:
-        ValueError: the file is missing or holds something else.
-    """
-    if weights is None:
-        return None
-    network = Lpips.of(load_state(weights))
-    return Perceptual("st_lpips" if network.is_shift_tolerant else "lpips", network)
 
 
 def _read_lpips(name: str, file: Path, device: torch.device) -> Lpips:

@@ -52,7 +52,7 @@ class TableScores:
         framing: scale of the asset in the truth's frame.
         capture: `depth` and `shape` by Stanford-ORB's script, in its units; empty elsewhere.
         features: of shown and true pictures by networks that compare sets, one row a picture;
-            see `stages.picture_sets`.
+            see `stages.set_figures`.
     """
 
     views: list[ViewScore]

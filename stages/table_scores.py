@@ -19,7 +19,8 @@ from stages.artifacts import ExportedAsset, MaterialViews
 from stages.base import Context, Stage
 from stages.errors import InputError
 from stages.orb_scores import capture_figures, orb_figures
-from stages.picture_networks import read_distance, read_encoders
+from stages.pair_distance import read_distance
+from stages.picture_networks import read_encoders
 from stages.picture_sets import PictureSets
 from stages.prefilter_cache import cached_operator
 from stages.scores_artifact import (
@@ -289,7 +290,7 @@ def _agreement(images: Images, cameras: Cameras, surface: Surface, gain: float) 
     compared = {"rgb_apart": straight}
     if "basecolor" in images:
         compared["apart"] = images["basecolor"][around]
-    figures = {}
+    figures: dict[str, float] = {}
     for name, linear in compared.items():
         found = view_consistency(srgb_from_linear(linear.clamp(0.0, 1.0)), depth, inside, cameras)
         figures |= {name: found.error, "compared": found.share}

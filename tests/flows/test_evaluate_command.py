@@ -1,5 +1,4 @@
 import csv
-import importlib.metadata
 import json
 from pathlib import Path
 
@@ -20,11 +19,7 @@ PHOTO = TableScoresConfig(from_photo=True)
 @pytest.fixture(autouse=True)
 def nothing_installed(monkeypatch):
     """Whatever networks lie on this machine, scores are told by none."""
-
-    def lacks(name):
-        raise importlib.metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr("stages.settings.picture_networks.importlib.metadata.distribution", lacks)
+    monkeypatch.setattr("stages.settings.picture_networks.DISTRIBUTION", "not-installed")
 
 
 @pytest.fixture

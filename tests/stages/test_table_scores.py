@@ -12,8 +12,8 @@ from sphere_orbit import sphere_cameras
 from stages.artifacts import ExportedAsset, MaterialViews
 from stages.errors import InputError
 from stages.missing_scores import run as missing_run
-from stages.picture_sets import set_figures
 from stages.scores_artifact import TableScores
+from stages.set_figures import set_figures
 from stages.settings.table_scores import TableScoresConfig
 from stages.table_scores import run
 from svim3d.io.exr import read_exr, read_rgb, write_exr, write_rgb
