@@ -133,9 +133,9 @@ def _told(row: str, lines: Mapping[str, Mapping[str, Values]], every: int, missi
     told = f"{row}: {len(missing)} of {every} without an asset"
     if missing:
         names = ", ".join(dict.fromkeys(name for name, _ in missing))
-        told += f", scored as white pictures ({names})"
+        told += f" ({names}), scored as white pictures"
     if unknown:
-        told += f"; of {', '.join(dict.fromkeys(unknown))} the truth cannot be read: not in means"
+        told += f" but for {', '.join(dict.fromkeys(unknown))}, whose truth cannot be read"
     spreads = _spreads(lines).rows
     worst = [
         f"{name.removesuffix(f', {OFFICIAL}')} {next(iter(figures.values())).worst_capture}"

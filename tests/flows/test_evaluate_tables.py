@@ -158,8 +158,8 @@ def test_rows_of_stanford_orb_count_what_is_missing_as_white():
     assert "novel views, official" not in lines
     note, told = found.notes
     assert note == "A note."
-    assert told.startswith("a: 2 of 3 without an asset, scored as white pictures (cup, pot)")
-    assert "of pot the truth cannot be read" in told
+    assert told.startswith("a: 2 of 3 without an asset (cup, pot), scored as white pictures but ")
+    assert "but for pot, whose truth cannot be read" in told
     assert "relit cup" in told
 
 
