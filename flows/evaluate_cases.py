@@ -24,6 +24,7 @@ from stages.store import Store
 
 MODULE, STAGE = "stages.table_scores", "table_scores"
 CASE_MODULE = "flows.evaluate_case"
+MISSING = "missing_scores"
 SCORES = "scores.json"
 LAST_STAGE, VIEWS_STAGE = "export", "generation"
 TINY_PX = 64  # rows of the views that settings of preset tiny are for
@@ -218,7 +219,31 @@ def known_scores(case: Case, store: Store) -> dict[str, Any] | None:
     if stored is None:
         return None
     page: dict[str, Any] = json.loads((stored.folder / SCORES).read_text())
-    return page | {"cost": _cost(case, store)}
+    return page | {"cost": _cost(case, store), "folder": str(stored.folder)}
+
+
+def missing_scores(subject: Subject, store: Store, config: TableScoresConfig) -> dict[str, Any]:
+    """What Stanford-ORB's script tells of an object that has no asset.
+
+    Raises:
+        InputError: the truth cannot be read.
+    """
+    from stages.execution import choose_device, run_stage
+    from stages.missing_scores import MISSING_SCORES
+
+    recipe = Recipe(
+        stage=MISSING,
+        config=config.model_dump(mode="json"),
+        seed=0,
+        inputs={"truth": digest_input(subject.truth)},
+        code=code_digests(f"stages.{MISSING}"),
+        versions=library_versions(),
+    )
+    inputs = {"truth": subject.truth}
+    device = choose_device("cpu")  # nothing is rendered
+    stored = run_stage(store, recipe, MISSING_SCORES, inputs, config=config, device=device)
+    page: dict[str, Any] = json.loads((stored.folder / SCORES).read_text())
+    return page
 
 
 def _cost(case: Case, store: Store) -> dict[str, float]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flows.evaluate_tables import HEADS, Line, Table
+from flows.evaluate_tables import ASSET, HEADS, Line, Pages, Table
 
 if TYPE_CHECKING:
     from stages.score_summary import Interval
@@ -20,6 +20,8 @@ CSV_COLUMNS = (
 )
 SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"}
 ABSENT = "-"
+
+Failure = tuple[str, str, int, str]  # row, object, seed, reason
 
 
 @dataclass(frozen=True)
@@ -67,8 +69,8 @@ def cell(line: Line, figure: str) -> Cell:
 
 def write_tables(
     tables: Sequence[Table],
-    results: Mapping[str, Mapping[str, Mapping[str, Any]]],
-    failures: Sequence[tuple[str, str, str]],
+    results: Mapping[str, Pages],
+    failures: Sequence[Failure],
     told: Sequence[str],
     folder: Path,
 ) -> None:
@@ -76,8 +78,8 @@ def write_tables(
 
     Args:
         tables: to write.
-        results: by row and object, what they were made of.
-        failures: row, object and reason of each case without scores.
+        results: by row, then by object and seed, what they were made of.
+        failures: row, object, seed and reason of each case without scores.
         told: paragraphs on how it was measured.
         folder: where to; made if need be.
     """
@@ -93,10 +95,10 @@ def write_tables(
     _write_csv(folder / CSV, CSV_COLUMNS, _csv_rows(tables, cells))
     _write_csv(
         folder / OBJECTS,
-        ("row", "object", "part", "subject", "light", "azimuth_deg", "figure", "value"),
+        ("row", "object", "seed", "part", "subject", "light", "azimuth_deg", "figure", "value"),
         _object_rows(results),
     )
-    _write_csv(folder / FAILURES, ("row", "object", "reason"), failures)
+    _write_csv(folder / FAILURES, ("row", "object", "seed", "reason"), failures)
 
 
 Cells = Mapping[tuple[str, int, str], Cell]
@@ -105,7 +107,7 @@ Cells = Mapping[tuple[str, int, str], Cell]
 def _markdown(
     tables: Sequence[Table],
     cells: Cells,
-    failures: Sequence[tuple[str, str, str]],
+    failures: Sequence[Failure],
     told: Sequence[str],
 ) -> str:
     lines = ["# Evaluation", "", *(text for paragraph in told for text in (paragraph, ""))]
@@ -118,7 +120,9 @@ def _markdown(
             lines.append(f"| {line.row} | {line.subject} | " + " | ".join(texts) + " |")
         lines += ["", *(text for note in table.notes for text in (note, ""))]
     lines += [f"## Failures: {len(failures)}", ""]
-    lines += [f"- {name}, {row}: {reason.splitlines()[-1]}" for row, name, reason in failures]
+    lines += [
+        f"- {name}, {row}, seed {seed}: {r.splitlines()[-1]}" for row, name, seed, r in failures
+    ]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -161,18 +165,18 @@ def _csv_rows(tables: Sequence[Table], cells: Cells) -> list[tuple[Any, ...]]:
     return rows
 
 
-def _object_rows(
-    results: Mapping[str, Mapping[str, Mapping[str, Any]]],
-) -> list[tuple[Any, ...]]:
+def _object_rows(results: Mapping[str, Pages]) -> list[tuple[Any, ...]]:
     """Every figure of every view: what the tables' means are of."""
     rows: list[tuple[Any, ...]] = []
     for row, pages in results.items():
-        for name, page in pages.items():
+        for sample, page in pages.items():
             for view in page["views"]:
                 where = (view["part"], view["subject"], view["light"], view["azimuth_deg"])
-                rows += [(row, name, *where, f, v) for f, v in view["figures"].items()]
-            for part, of in (("surface", "asset"), ("agreement", "drawn"), ("cost", "asset")):
-                rows += [(row, name, part, of, "", "", f, v) for f, v in page[part].items()]
+                rows += [(row, *sample, *where, f, v) for f, v in view["figures"].items()]
+            parts = [("agreement", of, found) for of, found in page["agreement"].items()]
+            parts += [(p, ASSET, page.get(p, {})) for p in ("surface", "capture", "cost")]
+            for part, of, found in parts:
+                rows += [(row, *sample, part, of, "", "", f, v) for f, v in found.items()]
     return rows
 
 

@@ -47,11 +47,13 @@ def evaluate_options() -> argparse.ArgumentParser:
         metavar="PX",
         help="most rows of views that are converted to our layout (%(default)s)",
     )
+    _add_networks(options)
     options.add_argument(
-        "--lpips",
-        type=Path,
-        metavar="FILE",
-        help="also tell LPIPS, by these weights: the state of lpips.LPIPS(net='alex' or 'vgg')",
+        "--seeds",
+        type=int,
+        default=1,
+        metavar="N",
+        help="repeat every row with N seeds, from --seed on (%(default)s)",
     )
     options.add_argument(
         "--limit",
@@ -86,4 +88,27 @@ def _add_rows(options: argparse.ArgumentParser) -> None:
         metavar=("NAME", "STAGE.NAME=VALUE"),
         help="one more row with other settings, compared with the first; preset=NAME and "
         "skip=STAGE are settings, too; may be repeated",
+    )
+
+
+def _add_networks(options: argparse.ArgumentParser) -> None:
+    """Weights of one's own, each for a figure."""
+    options.add_argument(
+        "--lpips",
+        type=Path,
+        metavar="FILE",
+        help="also tell LPIPS, by these weights: the state of lpips.LPIPS(net='alex' or 'vgg')",
+    )
+    options.add_argument(
+        "--fid",
+        type=Path,
+        metavar="FILE",
+        help="also tell FID of all pictures, by pytorch-fid's pt_inception-2015-12-05",
+    )
+    options.add_argument(
+        "--clip",
+        type=Path,
+        metavar="FOLDER",
+        help="also tell CMMD and CLIP-S, by a CLIPModel as transformers saves it (published CMMD: "
+        "openai/clip-vit-large-patch14-336)",
     )

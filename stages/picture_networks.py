@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.errors import InputError
+from stages.set_figures import CLIP
 from stages.settings.picture_networks import PictureNetworkSettings
 from svim3d.io.picture_networks import Encoder, read_clip, read_efficientnet, read_inception
 from svim3d.io.weights import load_state
@@ -62,16 +63,10 @@ class PictureNetworks:
             )
             if file is not None
         }
-        frechet: dict[str, Encoder] = {}
-        try:
-            if settings.efficientnet_weights is not None:
-                file = settings.efficientnet_weights
-                frechet["frechet_efficientnet"] = read_efficientnet(file, device)
-            if settings.inception_weights is not None:
-                frechet["fid"] = read_inception(settings.inception_weights, device)
-            clip = None if settings.clip_folder is None else read_clip(settings.clip_folder, device)
-        except ValueError as error:
-            raise InputError(str(error)) from error
+        frechet = read_encoders(
+            settings.efficientnet_weights, settings.inception_weights, settings.clip_folder, device
+        )
+        clip = frechet.pop(CLIP, None)
         return cls(distances, frechet, clip, device)
 
     def compare_pairs(
@@ -101,6 +96,31 @@ class PictureNetworks:
             if len(seen) == len(wanted):
                 figures["clip_similarity"] = clip_similarity(seen, wanted)
         return figures
+
+
+def read_encoders(
+    efficientnet: Path | None, inception: Path | None, clip: Path | None, device: torch.device
+) -> dict[str, Encoder]:
+    """Networks whose features sets are compared by: by the Fréchet figure they give, or `clip`.
+
+    Args:
+        efficientnet: state of EfficientNet-Lite0.
+        inception: state of pytorch-fid's Inception.
+        clip: folder of a CLIPModel.
+        device: that they shall live on.
+
+    Raises:
+        InputError: a named file is missing or holds something else.
+    """
+    named = (
+        ("frechet_efficientnet", efficientnet, read_efficientnet),
+        ("fid", inception, read_inception),
+        (CLIP, clip, read_clip),
+    )
+    try:
+        return {name: read(path, device) for name, path, read in named if path is not None}
+    except ValueError as error:
+        raise InputError(str(error)) from error
 
 
 def _read_lpips(name: str, file: Path, device: torch.device) -> Lpips:

@@ -2,17 +2,15 @@
 
 Reads the truth, the exported asset, the views of the pipeline and, for a photo, what the generator
 draws at the test cameras; writes `scores.json`: a line of figures for each view and subject, and
-those of the surface. `svim3d.render.view_figures` tells what each figure is.
+those of the surface; and where there are networks for it, features of the pictures.
+`svim3d.render.view_figures` tells what each figure is.
 
 Subjects: `drawn` are the generator's views; `relit` the same (of true views: themselves) under a
 light they never saw, in image space; `asset` is the finished file, rendered.
 """
 
-import json
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Self
 
 import torch
 from torch import Tensor
@@ -20,91 +18,45 @@ from torch import Tensor
 from stages.artifacts import ExportedAsset, MaterialViews
 from stages.base import Context, Stage
 from stages.errors import InputError
+from stages.orb_scores import capture_figures, orb_figures
+from stages.pair_distance import read_distance
+from stages.picture_networks import read_encoders
+from stages.picture_sets import PictureSets
 from stages.prefilter_cache import cached_operator
+from stages.scores_artifact import (
+    ASSET,
+    DRAWN,
+    GIVEN,
+    NOVEL,
+    REFERENCE,
+    RELIT,
+    TRUE,
+    TableScores,
+    ViewScore,
+)
 from stages.settings.table_scores import TableScoresConfig
 from stages.truth import SEEN, Truth, read_truth
 from svim3d.cameras import Cameras
 from svim3d.color import srgb_from_linear
 from svim3d.io.exr import read_rgb
 from svim3d.io.glb import read_mesh
-from svim3d.io.weights import load_state
-from svim3d.losses.lpips import Lpips
 from svim3d.mesh.source_mesh import SourceMesh
 from svim3d.metrics import occupancy, volume_iou
-from svim3d.metrics.stanford_orb import compare_pictures
 from svim3d.metrics.surface_agreement import compare_surfaces
 from svim3d.numerics import dot, normalize
-from svim3d.render.asset_figures import HALF_EXTENT
+from svim3d.render.asset_figures import HALF_EXTENT, Surface
 from svim3d.render.deferred import environment_shader
-from svim3d.render.framing import Framing
+from svim3d.render.framing import MIN_COVERAGE, Framing
 from svim3d.render.pictures import render_pictures
 from svim3d.render.view_consistency import mesh_depth, view_consistency
-from svim3d.render.view_figures import BUFFERS, COVERED, Perceptual, relit, view_figures
+from svim3d.render.view_figures import BUFFERS, COVERED, relit, view_figures
 from svim3d.shading.environment import octahedral_from_latlong
 from svim3d.shading.prefilter import EnvironmentPyramid
 
 GLB, LIGHT = "asset.glb", "environment.exr"
-REFERENCE, GIVEN, NOVEL, RELIT = "reference", "given", "novel", "relit"
-DRAWN, ASSET, TRUE = "drawn", "asset", "true views"
-ORB = "orb"
-LPIPS, SHIFT_TOLERANT = "lpips", "st_lpips"
 SAME_DIRECTION = 0.9998  # cosine of a degree
 
 Images = dict[str, Tensor]
-
-
-@dataclass(frozen=True)
-class ViewScore:
-    """Figures of one view.
-
-    Attributes:
-        part: `reference` (the photo's view), `given` (the other training views), `novel` (test
-            views under the same light) or `relit` (under another).
-        subject: `drawn`, `asset` or `true views`.
-        light: of the truth, by name.
-        azimuth_deg: of the camera, from the photo's, in [0, 360).
-        figures: by name.
-    """
-
-    part: str
-    subject: str
-    light: str
-    azimuth_deg: float
-    figures: dict[str, float]
-
-
-@dataclass(frozen=True)
-class TableScores:
-    """All figures of an asset.
-
-    Attributes:
-        views: of each view and subject.
-        surface: Chamfer distance, F-scores, consistency of normals, overlap of volumes; empty where
-            nobody knows the true surface.
-        agreement: of drawn views with each other where the asset's surface shows the same points
-            to neighbours: `apart`, the mean difference of sRGB basecolor, and `compared`, the
-            share of pixels that were; empty for true views.
-        framing: scale of the asset in the truth's frame.
-    """
-
-    views: list[ViewScore]
-    surface: dict[str, float]
-    agreement: dict[str, float]
-    framing: float
-
-    def save(self, folder: Path) -> None:
-        """Write `scores.json`."""
-        (folder / "scores.json").write_text(json.dumps(asdict(self), indent=1))
-
-    @classmethod
-    def load(cls, folder: Path) -> Self:
-        """Read it."""
-        page = json.loads((folder / "scores.json").read_text())
-        return cls(**page | {"views": [ViewScore(**view) for view in page["views"]]})
-
-    def headline(self) -> str:
-        """How many views were scored."""
-        return f"{len(self.views)} views scored"
 
 
 def run(
@@ -133,7 +85,12 @@ def run(
         known = read_truth(truth)
         scoring = _Scoring(known, export, generation, novel, config, ctx)
         return TableScores(
-            list(scoring.views()), scoring.surface(), scoring.agreement(), scoring.framing.scale
+            list(scoring.views()),
+            scoring.surface(),
+            scoring.agreement(),
+            scoring.framing.scale,
+            scoring.capture,
+            scoring.sets.features(),
         )
     except ValueError as error:
         raise InputError(f"{truth.name}: {error}") from error
@@ -160,7 +117,10 @@ class _Scoring:
         self._found = _found_light(export, ctx)
         # A photo's exposure is in the light that was found of it.
         self._own_gain = 1.0 if config.from_photo else truth.exposure
-        self._perceptual = _perceptual(config.lpips_weights)
+        self._perceptual = read_distance(config.lpips_weights)
+        self.capture: dict[str, float] = {}
+        weights = config.efficientnet_weights, config.inception_weights, config.clip_folder
+        self.sets = PictureSets(read_encoders(*weights, ctx.device))
 
     def _frame(self) -> Framing:
         if not self._config.from_photo:
@@ -205,16 +165,18 @@ class _Scoring:
             "volume_iou": volume_iou(*volumes),
         }
 
-    def agreement(self) -> dict[str, float]:
-        """How well drawn views agree with each other, whatever the truth."""
+    def agreement(self) -> dict[str, dict[str, float]]:
+        """How well drawn views agree with each other, and true ones, which are no generator's."""
         if not self._config.from_photo:
             return {}
-        views, mesh = self._generation, self._own_mesh
-        depth, covered = mesh_depth(mesh.vertices, mesh.faces, views.cameras)
-        mask = covered & (views.mask > COVERED)
-        basecolor = srgb_from_linear(views.basecolor.clamp(0.0, 1.0))
-        found = view_consistency(basecolor, depth, mask, views.cameras)
-        return {"apart": found.error, "compared": found.share}
+        views, own = self._generation, self._own_mesh
+        drawn = {name: getattr(views, name) for name in ("radiance", "mask", "basecolor")}
+        found = {DRAWN: _agreement(drawn, views.cameras, (own.vertices, own.faces), self._own_gain)}
+        if self._truth.given is not None and self._truth.surface is not None:
+            cameras, images, _ = self._truth.given
+            surface, gain = self._truth.surface, self._truth.exposure
+            found[TRUE] = _agreement(images, cameras, surface, gain)
+        return found
 
     def _pyramid(self, latlong: Tensor) -> EnvironmentPyramid:
         return self._operator(octahedral_from_latlong(latlong, self._config.light_size))
@@ -238,6 +200,8 @@ class _Scoring:
             for view in range(len(cameras)):
                 part = REFERENCE if view == reference else GIVEN
                 yield self._score(part, subject, SEEN, cameras, pictures, images, view)
+            others = [view for view in range(len(cameras)) if view != reference]
+            self._collect(subject, pictures, images, others)
 
     def _drawn_reference(
         self, cameras: Cameras, images: Images, reference: int
@@ -257,6 +221,11 @@ class _Scoring:
         for subject, pictures in shown.items():
             for view in range(len(cameras)):
                 yield self._score(NOVEL, subject, SEEN, cameras, pictures, images, view)
+            self._collect(subject, pictures, images, range(len(cameras)))
+        if self._config.stanford_orb:
+            mesh = self._mesh.vertices, self._mesh.faces
+            depths, generator = list(shown[ASSET]["depth"]), self._ctx.generator("orb shape")
+            self.capture = capture_figures(depths, mesh, self._truth, generator)
 
     def _relit(
         self, name: str, cameras: Cameras, images: Images, light: EnvironmentPyramid
@@ -273,6 +242,11 @@ class _Scoring:
         for subject, pictures in shown.items():
             for view in range(len(cameras)):
                 yield self._score(RELIT, subject, name, cameras, pictures, images, view, gain)
+
+    def _collect(self, subject: str, shown: Images, truth: Images, views: Sequence[int]) -> None:
+        """Keep features of views for the sets of all objects."""
+        gains = self._own_gain, self._truth.exposure
+        self.sets.add(subject, shown, truth, views, gains)
 
     def _framed(self, views: MaterialViews, cameras: Cameras) -> Images:
         """Drawn views as the truth's cameras have them; further ones are left out."""
@@ -298,25 +272,29 @@ class _Scoring:
             true_gain=self._truth.exposure,
             perceptual=self._perceptual,
         )
-        if self._config.stanford_orb and part in (NOVEL, RELIT):
-            mask, learned = true["mask"] > COVERED, self._perceptual
-            rows = compare_pictures(
-                mine["radiance"] * own_gain / self._truth.exposure,
-                true["radiance"],
-                mask,
-                scaled=part == RELIT,
-                lpips=None if learned is None or learned.name != LPIPS else learned.distance,
-            ).rows
-            figures |= {f"{ORB}.{r}.{n}": v for r, row in rows.items() for n, v in row.items()}
+        if self._config.stanford_orb:
+            own_gain /= self._truth.exposure
+            figures |= orb_figures(part, mine, true, gain=own_gain, learned=self._perceptual)
         return ViewScore(part, subject, light, _azimuth_deg(cameras, view), figures)
 
 
-def _perceptual(weights: Path | None) -> Perceptual | None:
-    """The distance that a user's weights are of, called by its name."""
-    if weights is None:
-        return None
-    network = Lpips.of(load_state(weights))
-    return Perceptual(SHIFT_TOLERANT if network.is_shift_tolerant else LPIPS, network)
+def _agreement(images: Images, cameras: Cameras, surface: Surface, gain: float) -> dict[str, float]:
+    """Differences of neighbours around the object where a surface shows them the same points."""
+    azimuths = [_azimuth_deg(cameras, view) for view in range(len(cameras))]
+    around = sorted(range(len(cameras)), key=azimuths.__getitem__)
+    cameras = cameras[around]
+    depth, covered = mesh_depth(*surface, cameras)
+    mask = images["mask"][around]
+    inside = covered & (mask > COVERED)
+    straight = images["radiance"][around] / mask.clamp_min(MIN_COVERAGE) * gain
+    compared = {"rgb_apart": straight}
+    if "basecolor" in images:
+        compared["apart"] = images["basecolor"][around]
+    figures: dict[str, float] = {}
+    for name, linear in compared.items():
+        found = view_consistency(srgb_from_linear(linear.clamp(0.0, 1.0)), depth, inside, cameras)
+        figures |= {name: found.error, "compared": found.share}
+    return figures
 
 
 def _subset(views: MaterialViews, chosen: list[int]) -> tuple[Cameras, Images]:

@@ -32,6 +32,8 @@ class Truth:
         novel: test views under the light of the given ones, None where there are none.
         relit: by the name of an unseen light, views under it, each group with its light.
         exposure: that makes the photo of the radiance.
+        unit: how many units of the capture's own world our unit of length is; 1 for our orbits.
+        origin: of that world, in ours.
     """
 
     surface: Surface | None
@@ -39,6 +41,8 @@ class Truth:
     novel: tuple[Cameras, dict[str, torch.Tensor]] | None
     relit: dict[str, list[LitViews]]
     exposure: float
+    unit: float = 1.0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def read_truth(folder: Path) -> Truth:
@@ -62,6 +66,7 @@ def read_truth(folder: Path) -> Truth:
         novel=views.get(SEEN),
         relit={n: _lit(folder, index, n, *views[n]) for n in lights if n != SEEN},
         exposure=float(photo.get("exposure", 1.0)),
+        **index.get("capture", {}),
     )
 
 

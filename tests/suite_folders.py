@@ -4,10 +4,11 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import torch
 import trimesh
 from scored_sphere import ball
-from sphere_orbit import sphere_images
+from sphere_orbit import RADIUS, sphere_images
 
 from svim3d.cameras import Cameras, look_at_origin
 from svim3d.color import srgb_from_linear
@@ -125,3 +126,30 @@ def write_orb(root: Path) -> None:
             camera_angle_x=math.radians(FOV_DEG),
         )
         write_mesh(truth / "mesh_blender" / "mesh.obj")
+        write_orb_maps(truth)
+
+
+def write_orb_maps(truth: Path) -> None:
+    """Albedo, normals in camera axes and depth in the world's units, of the test views."""
+    cameras = our_cameras("test")
+    images = sphere_images(cameras)
+    for folder in ("pseudo_gt_albedo", "surface_normal", "z_depth"):
+        (truth / folder).mkdir(parents=True)
+    for view in range(len(cameras)):
+        name = f"{view:04d}"
+        colour = srgb_from_linear(images["basecolor"][view])
+        write_png(truth / "pseudo_gt_albedo" / f"{name}.png", colour)
+        normal = images["normal_world"][view] @ cameras.c2w[view, :3, :3]
+        np.save(truth / "surface_normal" / f"{name}.npy", normal.numpy())
+        depth = torch.where(images["mask"][view] > 0, SIZE * sphere_depth(cameras, view), -1.0)
+        np.save(truth / "z_depth" / f"{name}.npy", depth[..., 0].numpy())
+
+
+def sphere_depth(cameras: Cameras, view: int) -> torch.Tensor:
+    """Along the camera's -z axis, our units; only the ball's pixels mean something."""
+    origin, direction = cameras.rays(view)
+    along = -(origin * direction).sum(-1, keepdim=True)
+    gap = RADIUS**2 - ((origin * origin).sum(-1, keepdim=True) - along**2)
+    distance = along - gap.clamp_min(0).sqrt()
+    forward = -cameras.c2w[view, :3, 2]
+    return (distance * direction @ forward[:, None]).view(cameras.height, cameras.width, 1)

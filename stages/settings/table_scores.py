@@ -32,3 +32,12 @@ class TableScoresConfig(FileReadingConfig):
     lpips_weights: Path | None = None
     """State of `lpips.LPIPS(net='alex')` or of another of its networks, backbone included, or of
     the shift-tolerant kind; None leaves the figure out."""
+
+    efficientnet_weights: Path | None = None
+    """State of EfficientNet-Lite0, whose features of pictures are kept for sets of them."""
+
+    inception_weights: Path | None = None
+    """State of pytorch-fid's Inception, the same for FID."""
+
+    clip_folder: Path | None = None
+    """Folder of transformers' CLIPModel, the same for CMMD and CLIP-S."""

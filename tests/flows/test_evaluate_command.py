@@ -1,9 +1,10 @@
+import csv
 import json
 from pathlib import Path
 
 import pytest
 from scored_sphere import write_truth
-from suite_folders import write_renders
+from suite_folders import write_orb, write_renders
 
 from flows import evaluate as command
 from flows.cli import _parser, main
@@ -15,6 +16,12 @@ from stages.store import Store
 PHOTO = TableScoresConfig(from_photo=True)
 
 
+@pytest.fixture(autouse=True)
+def nothing_installed(monkeypatch):
+    """Whatever networks lie on this machine, scores are told by none."""
+    monkeypatch.setattr("stages.settings.picture_networks.DISTRIBUTION", "not-installed")
+
+
 @pytest.fixture
 def suite(tmp_path):
     for name, size in (("ball", 16), ("marble", 20)):  # equal objects would have equal keys
@@ -22,14 +29,14 @@ def suite(tmp_path):
     return tmp_path / "suite"
 
 
-def planned(folder, store, *, from_photo=True, row=None):
+def planned(folder, store, *, from_photo=True, row=None, seed=0):
     return plan_case(
         Subject(folder.name, folder),
         row or Row("preview", "preview"),
         store,
         from_photo=from_photo,
         config=TableScoresConfig(from_photo=from_photo),
-        seed=0,
+        seed=seed,
     )
 
 
@@ -70,6 +77,42 @@ def test_scores_in_the_store_are_not_computed_again(suite, tmp_path, monkeypatch
     assert "21.00 [20.00, 22.00]" in text
 
 
+def test_rows_are_repeated_with_seeds(suite, tmp_path, monkeypatch, capsys):
+    store = Store(tmp_path / "store")
+    for name, seed, level in (("ball", 5, 20.0), ("ball", 6, 22.0), ("marble", 5, 30.0)):
+        put(planned(suite / name, store, seed=seed), store, level)
+    monkeypatch.setattr(command, "run_case", lambda *_, seed, **__: f"nerf: seed {seed} is bad")
+    assert main(arguments(suite, tmp_path, "--seed", "5", "--seeds", "2")) == 1
+    assert "marble, preview, seed 6: failed: nerf: seed 6 is bad" in capsys.readouterr().out
+    rows = list(csv.DictReader((tmp_path / "out" / "tables.csv").open()))
+    (row,) = [r for r in rows if (r["table"], r["figure"]) == ("materials", "basecolor_db")]
+    assert (float(row["mean"]), row["objects"]) == (25.5, "2")
+
+
+def test_a_capture_that_failed_is_scored_as_white_and_counted(tmp_path, monkeypatch):
+    write_orb(tmp_path / "orb")
+    (tmp_path / "orb" / "blender_HDR" / "ball_scene002" / "train" / "0002.exr").unlink()
+    monkeypatch.setattr(command, "run_case", lambda *_, **__: "nerf: the views are empty")
+    out = tmp_path / "out"
+    code = main(
+        (
+            *("evaluate", "stanford-orb", str(tmp_path / "orb"), "--preset", "preview"),
+            *("-o", str(out), "--store", str(tmp_path / "store")),
+        )
+    )
+    assert code == 1
+    rows = [r for r in csv.DictReader((out / "tables.csv").open()) if r["table"] == "stanford-orb"]
+    means = {(r["subject"], r["figure"]): float(r["mean"]) for r in rows if r["mean"]}
+    assert means["relit, official", "failed"] == 2.0
+    assert means["geometry, official", "normal"] == 1.0
+    # A scale per channel makes white as bright as the object; without it, it is much too bright.
+    assert means["relit, official", "psnr_ldr_db"] > means["relit, unscaled", "psnr_ldr_db"]
+    assert ("geometry, official", "depth") not in means
+    text = (out / "tables.md").read_text()
+    assert "2 of 2 without an asset (ball_scene001, ball_scene002), scored as white" in text
+    assert "but for ball_scene002, whose truth cannot be read" in text
+
+
 def test_failures_are_told_and_the_rest_is_scored(suite, tmp_path, monkeypatch, capsys):
     store = Store(tmp_path / "store")
     put(planned(suite / "marble", store), store, 22.0)
@@ -85,7 +128,7 @@ def test_failures_are_told_and_the_rest_is_scored(suite, tmp_path, monkeypatch, 
     told = capsys.readouterr().out
     assert "ball, preview: failed: nerf: the views are empty" in told
     assert "1 scored, 1 failed" in told
-    assert "ball,nerf: the views" in (tmp_path / "out" / "failures.csv").read_text()
+    assert "ball,0,nerf: the views" in (tmp_path / "out" / "failures.csv").read_text()
     # What failed is tried again, what is known is not.
     monkeypatch.setattr(
         command, "run_case", lambda case, **_: put(case, Store(tmp_path / "store"), 10.0)
@@ -165,6 +208,9 @@ def test_rows_may_leave_stages_out(suite, tmp_path):
         (("--row", "odd", "nerf.stepps=3"), "did you mean nerf.steps"),
         (("--row", "odd", "skip=nerf"), "later stages need it"),
         (("--size", "4"), "wanted 16 or more"),
+        (("--seeds", "0"), "wanted one or more"),
+        (("--fid", "nowhere.pth"), "there is no file nowhere.pth"),
+        (("--clip", "nowhere"), "wanted a folder with a CLIPModel"),
     ],
 )
 def test_what_is_wrong_for_all_is_refused(more, told, suite, tmp_path, capsys):

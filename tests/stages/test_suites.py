@@ -1,10 +1,20 @@
 import math
+import shutil
 
+import numpy as np
 import pytest
 import torch
 from scored_sphere import write_truth
 from sphere_orbit import sphere_images
-from suite_folders import AZIMUTHS_DEG, PHOTO_AZIMUTH_DEG, write_orb, write_renders
+from suite_folders import (
+    AZIMUTHS_DEG,
+    CENTRE,
+    PHOTO_AZIMUTH_DEG,
+    sphere_depth,
+    write_orb,
+    write_renders,
+)
+from suite_folders import SIZE as SIZE_THERE
 
 from stages.errors import InputError
 from stages.suites import list_objects, truth_folder
@@ -115,6 +125,49 @@ def test_a_capture_of_stanford_orb(tmp_path):
     # What was brightest in the photo's view is nearly white on the photo.
     photo = read_png(folder / "reference.png")
     assert 0.85 < float(photo[..., :3].max()) <= 1.0
+
+
+def test_maps_of_a_capture_s_test_views_are_read(tmp_path):
+    write_orb(tmp_path / "in")
+    _, truth = converted("stanford-orb", tmp_path / "in", "ball_scene001", tmp_path / "out")
+    cameras, images = truth.novel
+    assert images.keys() == {"radiance", "mask", "basecolor", "normal_world", "depth"}
+    true = sphere_images(cameras)
+    inside = (images["mask"] > 0.5) & (true["mask"] > 0.5)
+    # The normals' world turned with the photo's camera, which the sphere's own normals show.
+    there = inside.expand_as(true["normal_world"])
+    assert torch.allclose(images["normal_world"][there], true["normal_world"][there], atol=0.02)
+    # Depth is along the view, in the capture's units before.
+    wanted = torch.stack([sphere_depth(cameras, view) for view in range(2)])
+    steep = true["normal_world"] @ cameras.c2w[0, :3, 2] < 0.3  # of a rim a pixel spans much
+    chosen = (inside[:1] & ~steep[:1, ..., None])[0]
+    assert torch.allclose(images["depth"][0][chosen], wanted[0][chosen], atol=0.01)
+    assert float(images["basecolor"].max()) == pytest.approx(0.75, abs=0.01)
+    assert truth.unit == pytest.approx(SIZE_THERE, rel=1e-3)
+    # The capture's origin, in our world: as far from the object's centre as it was there.
+    far = torch.tensor(truth.origin).norm()
+    assert float(far) == pytest.approx(float(CENTRE.norm()) / SIZE_THERE, rel=1e-3)
+    _, others, _ = truth.given
+    assert others.keys() == {"radiance", "mask"}
+
+
+def test_maps_may_be_missing(tmp_path):
+    write_orb(tmp_path / "in")
+    (tmp_path / "in/ground_truth/ball_scene001/z_depth/0001.npy").unlink()
+    shutil.rmtree(tmp_path / "in/ground_truth/ball_scene001/pseudo_gt_albedo")
+    _, truth = converted("stanford-orb", tmp_path / "in", "ball_scene001", tmp_path / "out")
+    assert truth.novel[1].keys() == {"radiance", "mask", "normal_world"}
+
+
+def test_normals_of_other_axes_are_refused(tmp_path):
+    write_orb(tmp_path / "in")
+    file = tmp_path / "in/ground_truth/ball_scene001/surface_normal/0000.npy"
+    np.save(file, np.load(file) * np.array([1.0, -1.0, -1.0], np.float32))
+    with pytest.raises(InputError, match=r"0000\.npy, but most of them look away"):
+        converted("stanford-orb", tmp_path / "in", "ball_scene001", tmp_path / "out")
+    file.write_bytes(b"no array")
+    with pytest.raises(InputError, match="cannot be read as an array"):
+        converted("stanford-orb", tmp_path / "in", "ball_scene001", tmp_path / "out")
 
 
 def test_what_was_converted_is_found_again(tmp_path):

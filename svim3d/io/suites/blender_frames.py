@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -20,6 +21,7 @@ from svim3d.cameras import Cameras
 from svim3d.color import linear_from_srgb
 from svim3d.io.exr import read_exr, read_rgb
 from svim3d.io.image import read_png
+from svim3d.io.suites.truth_folder import SourceFrame
 from svim3d.numerics import normalize
 
 Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))  # (x, y, z up) -> (x, z, -y)
@@ -126,12 +128,29 @@ def read_radiance(
 
 
 def read_map(file: Path, *, is_colour: bool) -> Float[Tensor, "H W C"]:
-    """Values of a material or normal map; colours of PNG are decoded from sRGB."""
+    """Values of a material, normal or depth map; colours of PNG are decoded from sRGB.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    if file.suffix.lower() == ".npy":
+        return _read_array(file)
     if file.suffix.lower() == ".exr":
         return torch.from_numpy(read_rgb(file))
     picture = read_png(file)
     values = picture[..., :3] if picture.shape[-1] >= 3 else picture[..., :1].expand(-1, -1, 3)
     return linear_from_srgb(values) if is_colour else values
+
+
+def _read_array(file: Path) -> Float[Tensor, "H W C"]:
+    """An array of numpy, [H, W] or [H, W, C]."""
+    try:
+        values = np.load(file, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"{file} cannot be read as an array: {error}") from error
+    if values.ndim not in (2, 3) or not np.issubdtype(values.dtype, np.number):
+        raise ValueError(f"wanted numbers by row, column and channel in {file}, got {values.shape}")
+    return torch.from_numpy(values.astype(np.float32)).reshape(*values.shape[:2], -1)
 
 
 def shrunk(image: Float[Tensor, "H W C"], size: int) -> Float[Tensor, "h w C"]:
@@ -199,13 +218,18 @@ class OurFrame:
             1.0 / float((high - low).max()),
         )
 
-    def points(self, vertices: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    def points(self, vertices: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Positions in our world."""
         return (self.scale * (vertices.double() - self.centre) @ self.turn.T).float()
 
     def directions(self, values: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Unit directions in our world; zero stays zero."""
         return normalize(values @ self.turn.T.to(values)) * (values.square().sum(-1, True) > 0)
+
+    def source(self) -> SourceFrame:
+        """Where the capture's world lies in ours."""
+        x, y, z = self.points(torch.zeros(3)).tolist()
+        return SourceFrame(1.0 / self.scale, (x, y, z))
 
     def cameras(self, frames: Sequence[Frame], height: int, width: int) -> Cameras:
         """Cameras in our world; all are given the first one's field of view."""

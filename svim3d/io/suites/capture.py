@@ -26,6 +26,8 @@ from svim3d.shading.environment import direction_from_latlong, sample_latlong
 
 LIGHT_ROWS = 128  # of converted lights, twice as many columns
 PHOTO_PX = 512  # most rows of the photo
+COVERED = 0.5
+MIN_FACING = 0.5  # share of normals that face the camera; interpolated ones of a rim need not
 
 Mesh = tuple[Float[Tensor, "N 3"], Int[Tensor, "F 3"]]
 
@@ -38,8 +40,9 @@ class Picture:
         frame: its camera.
         image: radiance.
         mask: coverage, where the image has no opacity.
-        maps: basecolor, roughness, metallic and normal_world that are there, each with the channel
-            of the picture that holds it, or None for all three.
+        maps: basecolor, roughness, metallic, normal_world (or normal_camera: x right, y up, z to
+            the viewer) and depth that are there, each with the channel of the picture that holds
+            it, or None for all three.
         light: lat-long, that lit it; None where nobody knows it.
     """
 
@@ -91,6 +94,7 @@ def object_truth(
         photo=(shrunk(photo[0], PHOTO_PX), shrunk(photo[1], PHOTO_PX)),
         exposure=exposure_of(views.images, len(given) - 1, is_hdr=is_hdr),
         surface=None if mesh is None else (ours.points(mesh[0]), mesh[1]),
+        source=ours.source(),
     )
 
 
@@ -128,7 +132,9 @@ def _images(
         # Averaged with their coverage, so that nothing of the background gets in.
         laid = fitted(_map(picture, name, mask, ours) * mask)
         straight = laid / cover.clamp_min(MIN_COVERAGE) * (cover > 0)
-        images[name] = normalize(straight) * (cover > 0) if name == "normal_world" else straight
+        is_normal = name in ("normal_world", "normal_camera")
+        kept = normalize(straight) * (cover > 0) if is_normal else straight
+        images["normal_world" if is_normal else name] = kept
     return images
 
 
@@ -138,10 +144,34 @@ def _map(picture: Picture, name: str, mask: Tensor, ours: OurFrame) -> Tensor:
     values = read_map(file, is_colour=name == "basecolor")
     if values.shape[:2] != mask.shape[:2]:
         raise ValueError(f"wanted {file} as large as the picture it belongs to")
+    if channel is not None:
+        values = values[..., channel : channel + 1]
+    if name == "depth":  # not a number, or infinite, where there is nothing
+        return ours.scale * torch.where(values.isfinite(), values, 0.0)
+    if name == "normal_camera":
+        turned = _facing(values, mask, file) @ picture.frame.pose[:3, :3].T.float()
+        return ours.directions(turned * (mask > 0))
     if name != "normal_world":
-        return values if channel is None else values[..., channel : channel + 1]
+        return values
     is_encoded = file.suffix.lower() != ".exr"
     return ours.directions((2.0 * values - 1.0 if is_encoded else values) * (mask > 0))
+
+
+def _facing(
+    normals: Float[Tensor, "H W 3"], mask: Float[Tensor, "H W 1"], file: Path
+) -> Float[Tensor, "H W 3"]:
+    """Normals of what a camera sees, which face it.
+
+    Raises:
+        ValueError: most of them look away, so that their axes are not those that we know.
+    """
+    toward = normals[..., 2:][mask > COVERED]
+    if len(toward) and float((toward > 0.0).float().mean()) < MIN_FACING:
+        raise ValueError(
+            f"wanted normals with x right, y up and z to the viewer in {file}, but most of them "
+            "look away; turn them, or take the maps away to leave their figure out"
+        )
+    return normals
 
 
 def _lights(

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from svim3d.cameras import Cameras
 from svim3d.color import srgb_from_linear
 from svim3d.io.exr import write_exr, write_rgb
 from svim3d.io.image import write_png
-from svim3d.io.orbit import CHANNELS, INDEX
+from svim3d.io.orbit import CHANNELS, INDEX, OPTIONAL_CHANNELS
 
 MIN_COVERAGE = 1e-3  # below it a straight colour is undefined
 SEEN = "A"  # the light of the photo
@@ -38,6 +38,19 @@ class LitPictures:
 
 
 @dataclass(frozen=True)
+class SourceFrame:
+    """Where a capture's own world lies in ours, for figures that are told in its units.
+
+    Attributes:
+        unit: how many of its units our unit of length is.
+        origin: of its world, in ours.
+    """
+
+    unit: float
+    origin: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
 class ObjectTruth:
     """One object in our frame: y up, its longest side 1, the photo's camera at azimuth 0.
 
@@ -47,6 +60,7 @@ class ObjectTruth:
         photo: radiance (premultiplied) and coverage that the photo is made of.
         exposure: that makes the photo of the radiance.
         surface: vertices and faces; None if nobody scanned it.
+        source: the frame that all this came from.
     """
 
     given: LitPictures
@@ -54,6 +68,7 @@ class ObjectTruth:
     photo: tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 1"]]
     exposure: float
     surface: tuple[Float[Tensor, "N 3"], Int[Tensor, "F 3"]] | None
+    source: SourceFrame
 
 
 def write_truth(truth: ObjectTruth, folder: Path) -> None:
@@ -70,6 +85,7 @@ def write_truth(truth: ObjectTruth, folder: Path) -> None:
             "train_index": len(truth.given.cameras) - 1,
             "exposure": truth.exposure,
         },
+        "capture": asdict(truth.source),
     }
     by_pose: dict[str, dict[str, Any]] = {}
     for light, views in truth.tests.items():
@@ -106,7 +122,7 @@ def _write_views(folder: Path, split: str, views: LitPictures) -> list[dict[str,
     for view in range(len(views.cameras)):
         planes = {
             channel: views.images[name][view, ..., i].numpy()
-            for name, channels in CHANNELS.items()
+            for name, channels in (CHANNELS | OPTIONAL_CHANNELS).items()
             if name in views.images
             for i, channel in enumerate(channels)
         }
