@@ -75,6 +75,7 @@ ADDED = {
     "stability": ["--size", "32", "--views", "4", *SMALL_ASSET],
 }
 STORELESS = ("presets", "model")
+SHELL_S = 30.0  # of what is no command of ours: what runs on is a server, and no guide's to start
 
 pytestmark = [pytest.mark.flow, pytest.mark.slow]
 
@@ -191,7 +192,9 @@ def carry_out(command: str, store: Path, environment: dict[str, str] | None) -> 
     """Exit code and what was said."""
     words = shlex.split(command, comments=True)
     if words[0] != "svim3d":
-        done = subprocess.run(["sh", "-ec", command], capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            ["sh", "-ec", command], capture_output=True, text=True, check=False, timeout=SHELL_S
+        )
         return done.returncode, done.stdout + done.stderr
     arguments = svim3d_arguments(words[1:], store)
     if environment is not None:
