@@ -62,10 +62,13 @@ def run_page(
 
 
 def product_stages(plan: Plan) -> Iterable[str]:
-    """Stages with a picture that the user came for, the best first."""
-    for product in plan.pipeline.products:
-        if product.name.endswith(".png"):
-            yield from (stage for stage, _ in product.origins)
+    """Stages with a picture that the user came for, each once, the best first."""
+    return dict.fromkeys(
+        stage
+        for product in plan.pipeline.products
+        if product.name.endswith(".png")
+        for stage, _ in product.origins
+    )
 
 
 def _row(step: Step, stored: Stored | None) -> tuple[str, ...]:

@@ -42,4 +42,5 @@ def test_failure_comes_first_and_nothing_is_taken_for_markup(store, source):
 
 def test_best_picture_of_a_run_is_its_preview(store, source):
     plan = replace(plan_tiny(store, source), pipeline=IMAGE_TO_ASSET)
-    assert list(product_stages(plan)) == ["preview", "generation"]
+    # What export has of pictures are an OBJ's maps.
+    assert list(product_stages(plan)) == ["preview", "generation", "export"]
