@@ -119,6 +119,8 @@ def test_a_process_that_dies_or_lingers_is_a_result(tmp_path, monkeypatch):
     monkeypatch.setattr("flows.stability_cases.CASE_MODULE", "flows.no_such_module")
     found = run_case(case, settings)
     assert found["outcome"] == Outcome.CRASHED and "no_such_module" in found["error"]
+    # One that takes seconds to import what it needs.
+    monkeypatch.setattr("flows.stability_cases.CASE_MODULE", "flows.stability_case")
     hasty = Settings("tiny", (), 48, 8, tmp_path, 0.01)
     assert run_case(case, hasty)["outcome"] == Outcome.TOO_LONG
 
