@@ -16,7 +16,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from stages.statistics import Interval
+    from stages.score_summary import Interval
 
 # Standard errors that count as noise: repeats are few, and Student's t of 95 % is 3.2 for the three
 # degrees of freedom that two seeds of three orbits leave.
@@ -101,7 +101,7 @@ def difference(figures: Figures, point: str, other: str, axis: Axis) -> "Interva
 def _interval(
     one: tuple[tuple[str, float], ...], other: tuple[tuple[str, float], ...]
 ) -> "Interval":
-    from stages.statistics import paired_interval
+    from stages.score_summary import paired_interval
 
     return paired_interval(dict(one), dict(other))
 

@@ -112,7 +112,7 @@ def _on_paper(rgb: Float[Tensor, "H W 3"], mask: Float[Tensor, "H W 1"] | None) 
 
 def _order(views: MaterialViews) -> list[int]:
     """The reference first, then on around the object."""
-    azimuth = torch.atan2(views.cameras.positions[:, 0], views.cameras.positions[:, 2])
+    azimuth = views.cameras.azimuths
     around = (azimuth - azimuth[views.reference] + 1e-4).remainder(math.tau)
     return [int(view) for view in around.argsort(stable=True)]
 

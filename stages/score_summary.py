@@ -1,4 +1,4 @@
-"""Means over objects and paired differences, for flows that make tables of scores.
+"""Means over objects and paired differences, for flows that make tables or charts of scores.
 
 A sample is an object with a seed: a mean counts each object alike, whatever its number of seeds.
 """
@@ -19,6 +19,7 @@ from svim3d.metrics.statistics import (
     paired,
     summarize_samples,
 )
+from svim3d.metrics.statistics import paired_interval as paired_interval
 
 Sample = tuple[str, int]
 Values = Mapping[Sample, float]

@@ -55,6 +55,11 @@ class Cameras:
         return self.c2w[:, :3, 3]
 
     @property
+    def azimuths(self) -> Float[Tensor, "V"]:
+        """Where the cameras stand around the y axis: radians in [-pi, pi], 0 on +z."""
+        return torch.atan2(self.positions[:, 0], self.positions[:, 2])
+
+    @property
     def focal_px(self) -> float:
         """Focal length in pixels, equal for both axes."""
         return 0.5 * self.height / math.tan(math.radians(self.fov_y_deg) / 2)

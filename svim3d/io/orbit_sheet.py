@@ -50,7 +50,7 @@ def orbit_sheet(
 
 def _in_order(cameras: Cameras) -> list[int]:
     """Views sorted by azimuth, thinned to as many as the sheet has columns."""
-    azimuth = torch.atan2(cameras.positions[:, 0], cameras.positions[:, 2]).remainder(math.tau)
+    azimuth = cameras.azimuths.remainder(math.tau)
     # A camera at azimuth 0 may lie a rounding error below a full turn.
     order = (azimuth + 1e-4).remainder(math.tau).argsort(stable=True).tolist()
     columns = min(COLUMNS, len(order))

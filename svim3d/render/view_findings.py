@@ -75,7 +75,7 @@ def _few(cameras: Cameras) -> Iterator[Finding]:
 
 def widest_gap_deg(cameras: Cameras) -> float:
     """Largest difference in azimuth between neighbouring cameras; 360 for one."""
-    azimuth = torch.atan2(cameras.positions[:, 0], cameras.positions[:, 2]).sort().values
+    azimuth = cameras.azimuths.sort().values
     steps = torch.diff(azimuth, append=azimuth[:1] + math.tau)
     return math.degrees(float(steps.max()))
 
