@@ -5,6 +5,8 @@ tetrahedron with one or three nodes inside adds a triangle, with two inside a qu
 Source: Doi and Koide 1991; made differentiable in SDF and node positions by Shen et al. 2021.
 """
 
+from typing import Any
+
 import numba
 import numpy as np
 import torch
@@ -47,6 +49,7 @@ TRIANGLES = np.array(
 TRIANGLE_COUNT = (TRIANGLES >= 0).sum(1) // 3
 MIN_DIFFERENCE = 1e-6  # SDF difference along a crossed edge; bounds the gradient of its crossing
 
+Array = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int32]
 BoolArray = NDArray[np.bool_]
 
@@ -81,6 +84,18 @@ def crossing_points(
 
     p = a + s_a / (s_a - s_b) (b - a) for ends a, b of different sign.
     """
+    if sdf.device.type != "cpu":
+        return crossing_points_reference(nodes, sdf, edges)
+    points: Tensor = _Crossing.apply(  # type: ignore[no-untyped-call]
+        nodes, sdf, edges.int().contiguous()
+    )
+    return points
+
+
+def crossing_points_reference(
+    nodes: Float[Tensor, "N 3"], sdf: Float[Tensor, "N"], edges: Int[Tensor, "V 2"]
+) -> Float[Tensor, "V 3"]:
+    """`crossing_points` in plain torch, for any device."""
     flat = edges.reshape(-1).long()
     ends = nodes.index_select(0, flat).view(-1, 2, 3)
     values = sdf.index_select(0, flat).view(-1, 2)
@@ -88,6 +103,78 @@ def crossing_points(
     # The two values differ in sign, so that only their distance from zero needs a bound.
     guarded = torch.where(difference < 0.0, -1.0, 1.0) * difference.abs().clamp_min(MIN_DIFFERENCE)
     return torch.lerp(ends[:, 0], ends[:, 1], (values[:, 0] / guarded)[:, None])
+
+
+@kernel()
+def _guarded(difference: Any) -> Any:
+    """A difference of signed distances, no nearer to zero than `MIN_DIFFERENCE`."""
+    if difference < 0.0:
+        return min(difference, -MIN_DIFFERENCE)
+    return max(difference, MIN_DIFFERENCE)
+
+
+@kernel(parallel=True)
+def _cross(nodes: Array, sdf: Array, edges: IntArray, points: Array) -> None:
+    """The point on each edge."""
+    for e in numba.prange(edges.shape[0]):
+        a, b = edges[e, 0], edges[e, 1]
+        t = sdf[a] / _guarded(sdf[a] - sdf[b])
+        for axis in range(3):
+            points[e, axis] = nodes[a, axis] + t * (nodes[b, axis] - nodes[a, axis])
+
+
+@kernel()
+def _cross_backward(
+    nodes: Array,
+    sdf: Array,
+    edges: IntArray,
+    grad_points: Array,
+    grad_nodes: Array,
+    grad_sdf: Array,
+) -> None:
+    """Scatter to the ends; serial, because edges share them."""
+    for e in range(edges.shape[0]):
+        a, b = edges[e, 0], edges[e, 1]
+        difference = sdf[a] - sdf[b]
+        guarded = _guarded(difference)
+        t = sdf[a] / guarded
+        grad_t = 0.0
+        for axis in range(3):
+            grad = grad_points[e, axis]
+            grad_nodes[a, axis] += (1.0 - t) * grad
+            grad_nodes[b, axis] += t * grad
+            grad_t += grad * (nodes[b, axis] - nodes[a, axis])
+        moves = t if guarded == difference else 0.0  # of the denominator, which may be held
+        grad_sdf[a] += grad_t * (1.0 - moves) / guarded
+        grad_sdf[b] += grad_t * moves / guarded
+
+
+class _Crossing(torch.autograd.Function):
+    """The kernels as one differentiable operator."""
+
+    @staticmethod
+    def forward(ctx: Any, nodes: Tensor, sdf: Tensor, edges: Tensor) -> Tensor:
+        """Points on the edges."""
+        nodes, sdf = nodes.detach().contiguous(), sdf.detach().contiguous()
+        points = nodes.new_empty(len(edges), 3)
+        _cross(nodes.numpy(), sdf.numpy(), edges.numpy(), points.numpy())
+        ctx.save_for_backward(nodes, sdf, edges)
+        return points
+
+    @staticmethod
+    def backward(ctx: Any, grad_points: Tensor) -> tuple[Tensor, Tensor, None]:
+        """Gradients of node positions and values."""
+        nodes, sdf, edges = ctx.saved_tensors
+        grad_nodes, grad_sdf = torch.zeros_like(nodes), torch.zeros_like(sdf)
+        _cross_backward(
+            nodes.numpy(),
+            sdf.numpy(),
+            edges.numpy(),
+            grad_points.contiguous().numpy(),
+            grad_nodes.numpy(),
+            grad_sdf.numpy(),
+        )
+        return grad_nodes, grad_sdf, None
 
 
 def find_crossings(

@@ -8,6 +8,7 @@ from svim3d.mesh.mesh import (
     face_normals_scaled,
     signed_volume,
     vertex_normals,
+    vertex_normals_reference,
 )
 
 OCTAHEDRON = torch.tensor(
@@ -31,6 +32,21 @@ def test_vertex_normals_of_an_octahedron_point_outward():
 def test_vertex_normals_are_differentiable():
     vertices = OCTAHEDRON.clone().requires_grad_(True)
     assert torch.autograd.gradcheck(lambda v: vertex_normals(v, FACES), (vertices,))
+
+
+def test_the_torch_twin_gives_the_same_normals_and_gradients():
+    draw = torch.Generator().manual_seed(0)
+    vertices = torch.randn(40, 3, generator=draw)
+    faces = torch.randint(0, 39, (90, 3), generator=draw)  # soup, flat faces, an idle vertex
+    pull = torch.randn(40, 3, generator=draw)
+    found = []
+    for normals in (vertex_normals, vertex_normals_reference):
+        leaf = vertices.clone().requires_grad_()
+        value = normals(leaf, faces)
+        found.append((value.detach(), torch.autograd.grad((value * pull).sum(), leaf)[0]))
+    assert torch.equal(found[0][0][39], torch.zeros(3))
+    for fast, plain in zip(*found, strict=True):
+        torch.testing.assert_close(fast, plain, rtol=1e-4, atol=1e-5)
 
 
 def test_adjacency_is_mutual_and_complete_on_a_closed_mesh():
