@@ -30,7 +30,7 @@ from flows.evaluate_sets import samples_table, sets_table
 from flows.evaluate_tables import Sample, tables_of
 from flows.stopping import interrupt_on_stop
 from stages.errors import InputError
-from stages.settings.picture_networks import PictureNetworkSettings
+from stages.installed import EFFICIENTNET_LITE0, installed_weights
 from stages.settings.table_scores import TableScoresConfig
 from stages.store import Store
 
@@ -108,12 +108,11 @@ def scores_config(options: argparse.Namespace) -> TableScoresConfig:
         raise InputError(
             f"--clip: wanted a folder with a CLIPModel, but {options.clip} is none; check the path"
         )
-    installed = PictureNetworkSettings.model_validate({})
     return TableScoresConfig(
         from_photo=options.made_from == PHOTO,
         stanford_orb=options.suite == ORB,
         lpips_weights=options.lpips and options.lpips.resolve(),
-        efficientnet_weights=installed.efficientnet_weights,
+        efficientnet_weights=installed_weights(*EFFICIENTNET_LITE0),
         inception_weights=options.fid and options.fid.resolve(),
         clip_folder=options.clip and options.clip.resolve(),
     )

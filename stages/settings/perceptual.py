@@ -1,18 +1,12 @@
 """Settings of the loss that compares pictures instead of pixels, which phases 1 and 2 share."""
 
-import contextlib
-import importlib.metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 
+from stages.installed import SHIFT_TOLERANT_LPIPS, installed_weights
 from stages.settings.base import FileReadingConfig
-
-# A distribution that carries the shift-tolerant AlexNet with its weights; its code is never
-# imported: some of its files are CC BY-NC-SA, the rest BSD.
-DISTRIBUTION = "stlpips-pytorch"
-FILE_NAME = "stlpips_pytorch/weights/vST0.0/alex_shift_tolerant.pth"
 
 
 class PerceptualSettings(FileReadingConfig):
@@ -39,10 +33,8 @@ class PerceptualSettings(FileReadingConfig):
         if not isinstance(given, dict) or given.get("perceptual") not in ("auto", "st_lpips"):
             return given
         if given.get("perceptual_weights") is None:
-            with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-                file = importlib.metadata.distribution(DISTRIBUTION).locate_file(FILE_NAME)
-                if Path(str(file)).is_file():
-                    return given | {"perceptual_weights": Path(str(file))}
+            found = installed_weights(*SHIFT_TOLERANT_LPIPS)
+            return given if found is None else given | {"perceptual_weights": found}
         return given
 
     @model_validator(mode="after")
@@ -53,9 +45,10 @@ class PerceptualSettings(FileReadingConfig):
                 "perceptual lpips wants perceptual_weights: the state of lpips.LPIPS(net='alex')"
             )
         if self.perceptual == "st_lpips" and self.perceptual_weights is None:
+            package = SHIFT_TOLERANT_LPIPS[0]
             raise ValueError(
-                f"perceptual st_lpips wants the weights in {DISTRIBUTION}: pip install --no-deps "
-                f"{DISTRIBUTION}, or give perceptual_weights"
+                f"perceptual st_lpips wants the weights in {package}: pip install --no-deps "
+                f"{package}, or give perceptual_weights"
             )
         if self.perceptual in ("none", "dssim") and self.perceptual_weights is not None:
             raise ValueError(f"perceptual {self.perceptual} uses no weights: leave out one of both")

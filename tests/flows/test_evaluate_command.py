@@ -19,7 +19,7 @@ PHOTO = TableScoresConfig(from_photo=True)
 @pytest.fixture(autouse=True)
 def nothing_installed(monkeypatch):
     """Whatever networks lie on this machine, scores are told by none."""
-    monkeypatch.setattr("stages.settings.picture_networks.DISTRIBUTION", "not-installed")
+    monkeypatch.setattr("flows.evaluate.EFFICIENTNET_LITE0", ("not-installed", "file"))
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ def weights(tmp_path):
 
 @pytest.fixture
 def no_extra(monkeypatch):
-    monkeypatch.setattr(settings, "DISTRIBUTION", "no-such-distribution")
+    monkeypatch.setattr(settings, "SHIFT_TOLERANT_LPIPS", ("no-such-distribution", "file"))
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def extra(tmp_path, monkeypatch, weights):
     about.mkdir()
     (about / "METADATA").write_text("Name: stlpips-pytorch\nVersion: 0.0.2\n")
     monkeypatch.syspath_prepend(tmp_path)
-    file = tmp_path / settings.FILE_NAME
+    file = tmp_path / settings.SHIFT_TOLERANT_LPIPS[1]
     file.parent.mkdir(parents=True)
     (tmp_path / "stlpips_pytorch" / "__init__.py").write_text("raise RuntimeError")
     weights("shift tolerant").rename(file)
