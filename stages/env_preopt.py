@@ -14,11 +14,9 @@ the model cannot explain, as outliers.
 paper's ablation "without environment lighting" (its light is SV3D's).
 """
 
-import math
-
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from stages.artifacts import EnvironmentLight, MaterialViews
 from stages.base import Context, Stage
@@ -27,6 +25,7 @@ from stages.errors import InputError
 from stages.prefilter_cache import cached_operator
 from stages.settings.env_preopt import EnvPreoptConfig
 from svim3d.numerics import dot, normalize
+from svim3d.optim import NamedAdam, Rate, cosine
 from svim3d.shading.octahedral import total_variation
 from svim3d.shading.spherical_gaussians import LOBES, lobes_over_sphere, log_octahedral
 from svim3d.shading.stored_shading import StoredShading
@@ -34,6 +33,8 @@ from svim3d.shading.stored_shading import StoredShading
 BLACK_LEVEL = 0.02  # of the mean radiance: below it the square root no longer magnifies noise
 CLIPPED_SHARE = 1e-3  # of all values; if so many equal the largest, they are clipped highlights
 MIN_RADIANCE = 1e-6  # keeps the logarithm of the starting light finite for black pictures
+LIGHT = "light"  # name of the parameter
+ADAM_EPS = 1e-8  # texels that nothing reflects keep the light they started with
 ADAM_BETAS = (0.9, 0.95)  # the second moment forgets in 20 of 200 steps, as log radiance settles
 
 
@@ -64,32 +65,31 @@ def run(
     start = radiance.sum(0) / shading(operator(white)).sum(0).clamp_min(MIN_RADIANCE)
     light = _start_light(start.clamp_min(MIN_RADIANCE), config)
     objective = _Objective(radiance, trust)
-    optimizer = torch.optim.Adam([light], lr=config.learning_rate, betas=ADAM_BETAS)
-    for step in range(_resume(ctx, light, optimizer), config.steps):
+    rates = {LIGHT: Rate(config.learning_rate, eps=ADAM_EPS)}
+    adam = NamedAdam({LIGHT: light}, rates, betas=ADAM_BETAS)
+    for step in range(_resume(ctx, adam), config.steps):
         if ctx.checkpoints.due():
-            _checkpoint(ctx, step, light, optimizer)
+            ctx.checkpoints.save(step, adam.state())
         log_radiance = _log_radiance(light, config)
         terms = {
             "photometric": objective(shading(operator(log_radiance.exp()))),
             "smooth": config.smooth_weight * total_variation(log_radiance),
             "white": config.white_weight * _departure_from_grey(log_radiance),
         }
-        optimizer.zero_grad()
+        adam.zero_grad()
         ctx.report(step + 1, config.steps, {name: t.item() for name, t in terms.items()})
         if not ctx.is_finite(step, terms):
             continue
         torch.stack(list(terms.values())).sum().backward()
-        rate = config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
-        optimizer.param_groups[0]["lr"] = rate
-        optimizer.step()
+        adam.step(cosine(step, config.steps, warm_up=0, final=0.0))
     return EnvironmentLight(_log_radiance(light, config).detach().exp().cpu())
 
 
-def _start_light(radiance: Float[Tensor, "3"], config: EnvPreoptConfig) -> Float[Tensor, "..."]:
+def _start_light(radiance: Float[Tensor, "3"], config: EnvPreoptConfig) -> nn.Parameter:
     """What is optimised, for an even light: log radiance of all texels, or a row for each lobe."""
     if config.light == "spherical_gaussians":
-        return lobes_over_sphere(LOBES, radiance.mean()).requires_grad_()
-    return radiance.log().repeat(config.size, config.size, 1).requires_grad_()
+        return nn.Parameter(lobes_over_sphere(LOBES, radiance.mean()))
+    return nn.Parameter(radiance.log().repeat(config.size, config.size, 1))
 
 
 def _log_radiance(light: Float[Tensor, "..."], config: EnvPreoptConfig) -> Float[Tensor, "n n 3"]:
@@ -168,24 +168,13 @@ def _usable_pixels(
     return pixels_of | {"normal": normalize(pixels_of["normal"]), "wo": wo}
 
 
-def _checkpoint(ctx: Context, step: int, x: Tensor, optimizer: torch.optim.Adam) -> None:
-    """Keep everything that the steps from `step` on depend on."""
-    moments = {f"adam.{name}": value for name, value in optimizer.state[x].items()}
-    ctx.checkpoints.save(step, {"light": x, **moments})
-
-
-def _resume(ctx: Context, x: Tensor, optimizer: torch.optim.Adam) -> int:
+def _resume(ctx: Context, adam: NamedAdam) -> int:
     """Restore the last checkpoint, if there is one; the step to go on with."""
     saved = ctx.checkpoints.load()
     if saved is None:
         return 0
     step, state = saved
-    with torch.no_grad():
-        x.copy_(state.pop("light"))
-    optimizer.state[x] = {
-        name.removeprefix("adam."): value if name == "adam.step" else value.to(x.device)
-        for name, value in state.items()
-    }
+    adam.load_state(state)
     return step
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 BETAS = (0.9, 0.99)  # Source: Mueller et al. 2022, sec. 4: short memory for sparse gradients
 MOMENTS = ("exp_avg", "exp_avg_sq")
@@ -26,30 +27,69 @@ class Rate:
 
 
 class NamedAdam:
-    """Adam with a rate per parameter, a common schedule, and parameters that may be replaced."""
+    """Adam with a rate per parameter, a common schedule, and parameters that may be replaced.
 
-    def __init__(self, parameters: Mapping[str, nn.Parameter], rates: Mapping[str, Rate]) -> None:
+    It calls torch's fused step itself: the first `torch.optim.Optimizer` of a process imports
+    torch's compiler, which takes longer than some stages.
+
+    Args:
+        parameters: what is optimised, by name.
+        rates: of each.
+        betas: decay of the first and of the second moment.
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, nn.Parameter],
+        rates: Mapping[str, Rate],
+        *,
+        betas: tuple[float, float] = BETAS,
+    ) -> None:
         self.parameters = dict(parameters)
         self._rates = dict(rates)
-        groups = [
-            {"params": [p], "name": n, "eps": rates[n].eps} for n, p in self.parameters.items()
-        ]
-        self._adam = torch.optim.Adam(groups, lr=0.0, betas=BETAS, fused=True)
+        self._betas = betas
+        self._state: dict[str, dict[str, Tensor]] = {}
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
-        self._adam.zero_grad(set_to_none=True)
+        for parameter in self.parameters.values():
+            parameter.grad = None
 
     def gradients(self) -> dict[str, Tensor]:
         """Sum of each parameter's gradient: finite unless some entry is not."""
         named = self.parameters.items()
         return {f"gradient of {n}": p.grad.sum() for n, p in named if p.grad is not None}
 
+    @torch.no_grad()
     def step(self, share: float) -> None:
-        """One step at `share` of every rate."""
-        for group in self._adam.param_groups:
-            group["lr"] = self._rates[group["name"]].step * share
-        self._adam.step()
+        """One step at `share` of every rate, of all parameters that have a gradient."""
+        for name, parameter in self.parameters.items():
+            if parameter.grad is None:
+                continue
+            state = self._state.get(name) or self._begin(name)
+            adam(
+                [parameter],
+                [parameter.grad],
+                [state["exp_avg"]],
+                [state["exp_avg_sq"]],
+                [],
+                [state["step"]],
+                fused=True,
+                amsgrad=False,
+                beta1=self._betas[0],
+                beta2=self._betas[1],
+                lr=self._rates[name].step * share,
+                weight_decay=0.0,
+                eps=self._rates[name].eps,
+                maximize=False,
+            )
+
+    def _begin(self, name: str) -> dict[str, Tensor]:
+        """State of a parameter without a past; the fused step counts on the parameter's device."""
+        value = self.parameters[name].detach()
+        moments = {moment: torch.zeros_like(value) for moment in MOMENTS}
+        self._state[name] = {"step": torch.zeros((), device=value.device), **moments}
+        return self._state[name]
 
     def replace(
         self,
@@ -67,26 +107,22 @@ class NamedAdam:
             carry: (`exp_avg` or `exp_avg_sq`, old moment) -> moment of the new parameter; without
                 it the new parameter starts without a past.
         """
-        state = self._adam.state.pop(self.parameters[name], None)
-        (group,) = [g for g in self._adam.param_groups if g["name"] == name]
-        group["params"] = [parameter]
+        state = self._state.pop(name, None)
         self.parameters[name], self._rates[name] = parameter, rate
         if state and carry is not None:
             carried = {moment: carry(moment, state[moment]) for moment in MOMENTS}
-            self._adam.state[parameter] = {"step": state["step"], **carried}
+            self._state[name] = {"step": state["step"], **carried}
 
     def remove(self, name: str) -> None:
         """Forget a parameter."""
-        self._adam.state.pop(self.parameters.pop(name), None)
-        groups = self._adam.param_groups
-        groups[:] = [group for group in groups if group["name"] != name]
+        del self.parameters[name]
+        self._state.pop(name, None)
 
     def state(self) -> dict[str, Tensor]:
         """Parameters, moments and step counts, detached."""
         tensors = {f"value.{name}": p.detach() for name, p in self.parameters.items()}
-        for name, parameter in self.parameters.items():
-            for key, value in self._adam.state[parameter].items():
-                tensors[f"{key}.{name}"] = value
+        for name, state in self._state.items():
+            tensors |= {f"{key}.{name}": value for key, value in state.items()}
         return tensors
 
     def load_state(self, tensors: Mapping[str, Tensor]) -> None:
@@ -96,8 +132,7 @@ class NamedAdam:
                 parameter.copy_(tensors[f"value.{name}"])
                 keys = [key for key in ("step", *MOMENTS) if f"{key}.{name}" in tensors]
                 if keys:
-                    # Fused Adam counts its steps on the parameter's device.
-                    self._adam.state[parameter] = {
+                    self._state[name] = {
                         key: tensors[f"{key}.{name}"].clone().to(parameter.device) for key in keys
                     }
 
