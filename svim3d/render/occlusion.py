@@ -13,6 +13,9 @@ from torch import Tensor
 from svim3d.compiled import kernel
 
 START_CELLS = 2.0  # rays start this far off the surface, which the grid knows to within a cell
+# And from this far above it, for a decimated mesh lies partly below: without it the flanks of a
+# ball of 720 faces hide 1.1 % of the sky from each other (RMS), with it 0.2 %.
+LIFT_CELLS = 0.5
 MIN_STEP_CELLS = 0.5  # keeps rays that graze the surface from creeping
 CONTACT_CELLS = 0.1  # nearer than this a ray has met the surface
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
@@ -102,8 +105,8 @@ def _occlusion(
 ) -> None:
     scale = (sdf.shape[0] - 1) / (2.0 * half_extent)
     for i in prange(points.shape[0]):
-        origin = (points[i] + half_extent) * scale
         n = normals[i]
+        origin = (points[i] + half_extent) * scale + LIFT_CELLS * n
         # Orthonormal frame about the normal, without a branch. Source: Duff et al. 2017.
         sign = 1.0 if n[2] >= 0.0 else -1.0
         a = -1.0 / (sign + n[2])

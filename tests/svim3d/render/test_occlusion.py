@@ -24,6 +24,18 @@ def test_a_convex_body_sees_the_whole_sky():
     assert open_sky.min() == 1
 
 
+def test_points_a_little_below_a_convex_surface_see_the_whole_sky():
+    points = node_positions(64, HALF, like=torch.zeros(1))
+    sdf = 0.3 - points.norm(dim=-1)
+    normal = torch.nn.functional.normalize(
+        torch.randn(200, 3, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    cell = 2 * HALF / 63
+    sunken = (0.3 - 0.4 * cell) * normal  # as far as the middle of a coarse mesh's edge
+    open_sky = ambient_occlusion(sunken, normal, sdf, half_extent=HALF, rays=64)
+    assert open_sky.min() > 0.98
+
+
 def test_the_foot_of_a_wall_sees_half_of_it():
     # Floor y < -0.3 and wall x < -0.3: at the wall's foot all directions with x < 0 are blocked,
     # as far as the grid reaches.
