@@ -35,10 +35,11 @@ def job_options() -> argparse.ArgumentParser:
         job.add_argument(option, dest=target, metavar="STAGE", help=purpose)
     job.add_argument(
         "--force",
-        action="append",
+        action="extend",
+        type=_names,
         default=[],
-        metavar="STAGE",
-        help="recompute a stage though nothing changed; may be repeated",
+        metavar="STAGE,...",
+        help="recompute stages though nothing changed; may be repeated",
     )
     add_timeout(job)
     add_share(job)
@@ -58,6 +59,11 @@ def shared_options() -> argparse.ArgumentParser:
         help="where artifacts are kept (%(default)s)",
     )
     return shared
+
+
+def _names(text: str) -> list[str]:
+    """Names between commas."""
+    return [name for name in text.split(",") if name]
 
 
 def add_share(parser: argparse.ArgumentParser) -> None:
@@ -86,10 +92,11 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--skip",
-        action="append",
+        action="extend",
+        type=_names,
         default=[],
-        metavar="STAGE",
-        help=f"leave a stage out ({', '.join(IMAGE_TO_ASSET.skippable)}); may be repeated",
+        metavar="STAGE,...",
+        help=f"leave stages out ({', '.join(IMAGE_TO_ASSET.skippable)}); may be repeated",
     )
 
 

@@ -229,7 +229,17 @@ def test_clock_that_jumps_changes_no_result(store, source, tmp_path, monkeypatch
         [],
         ["photo", "--preset", "paper", "--seed", "7", "--device", "cpu"],
         ["a b.png", "-o", "out put", "--set", "nerf.steps=3", "--set", "skip=[dmtet]"],
-        ["x.glb", "--from", "nerf", "--until", "export", "--skip", "dmtet", "--skip", "preview"],
+        [
+            "x.glb",
+            "--from",
+            "nerf",
+            "--until",
+            "export",
+            "--skip",
+            "dmtet,capacity",
+            "--skip",
+            "preview",
+        ],
         ["x.glb", "--only", "nerf", "--force", "nerf", "--samples", "3", "--model", "m o"],
     ],
 )
