@@ -41,6 +41,7 @@ NORMALS_PER_CELL = 2.0  # a grid's gradient is a step where an averaged picture 
 TEXELS_USED = 0.5  # share of an atlas that shows surface
 TEXELS_PER_ROOM = 4.0  # two along each axis: what is baked is averaged down once more
 SEEN_EVERY = 64  # steps of phase 1 in which each pixel of the object is seen once
+LOOKS_PER_VIEW = 30  # of phase 2, which renders one view a step; see docs/capacity.md
 FACES_PER_ROOM = 4.0  # triangles for a square of the side that normals can be averaged over
 MOST_AVERAGED = 4  # pixels; beyond that pictures say too little of the outline
 LEAST_TEXTURE, LEAST_FACES, LEAST_RAYS = 64, 1000, 512
@@ -58,6 +59,7 @@ class _Evidence:
     sharpest_alpha: float
     shape: Outline
     hull: HullEvidence
+    views: int
     longest_px: int
     covered: float  # pixels of all views that show the object
     pixel: float  # side of the smallest pixel, where the object is nearest, world units
@@ -126,6 +128,7 @@ def _read(views: MaterialViews, config: CapacityConfig) -> _Evidence:
         sharpest_alpha=_quantile(roughness.square()[:, 0], SHARP_SHARE),
         shape=outline(views.mask),
         hull=hull_evidence(views.cameras, views.mask, config.half_extent),
+        views=len(views.cameras),
         covered=float(views.mask.double().sum()),
         longest_px=max(views.cameras.height, views.cameras.width),
         pixel=float(distance.mean() - NEAR_SIDE) / views.cameras.focal_px,
@@ -168,6 +171,11 @@ def _image_choices(evidence: _Evidence, config: CapacityConfig) -> list[Proposal
             "nerf.rays_per_step",
             max(LEAST_RAYS, rays),
             f"{pixels:.0f} pixels show the object, each of them once in {SEEN_EVERY} steps",
+        ),
+        (
+            "dmtet.steps",
+            LOOKS_PER_VIEW * evidence.views,
+            f"{evidence.views} views, each of them looked at {LOOKS_PER_VIEW} times",
         ),
     ]
 
