@@ -22,7 +22,7 @@ from stages.settings.export import ExportConfig
 from svim3d.cameras import fitting_radius, orbit_angles, orbit_cameras
 from svim3d.io.exr import write_rgb
 from svim3d.io.glb import glb_bytes
-from svim3d.mesh.cleanup import CleanMesh, clean_surface, decimate, is_closed
+from svim3d.mesh.cleanup import clean_surface, decimate, is_closed
 from svim3d.mesh.mesh import signed_volume, vertex_normals
 from svim3d.mesh.texels import rasterize_uv
 from svim3d.numerics import normalize
@@ -88,23 +88,24 @@ def _glb(mesh: TexturedMesh) -> bytes:
 
 
 def _coarser(mesh: TexturedMesh, levels: int) -> Iterator[tuple[TexturedMesh, ShapeError]]:
-    """Levels of detail of growing error, each decimated from the mesh before it to fewer faces."""
+    """Levels of detail of growing error against the whole mesh, each of fewer faces.
+
+    The sides of their textures are halved from level to level, as mipmaps are.
+    """
     radius = fitting_radius(mesh.vertices, FOV_Y_DEG, FILL)
     angles = orbit_angles(LOD_VIEWS, 0.0, LOD_SWING_DEG)
     cameras = orbit_cameras(angles, radius=radius, fov_y_deg=FOV_Y_DEG, size=LOD_PICTURE_PX)
     whole, index = torch.unique(mesh.vertices, dim=0, return_inverse=True)
     welded = index[mesh.faces.long()].to(mesh.faces.dtype)
     pictures = ShapePictures.of_surface(whole, welded, cameras)
-    last = CleanMesh(whole, welded)
+    most, shrink = len(welded), 1
     for limit in COARSER[:levels]:
-        found = decimate_to_error(
-            last.vertices, last.faces, pictures, limit=limit, max_faces=len(last.faces)
-        )
-        if len(found.mesh.faces) >= len(last.faces):
+        found = decimate_to_error(whole, welded, pictures, limit=limit, max_faces=most)
+        coarser = found.mesh
+        if len(coarser.faces) >= most:
             continue  # decimation has come to its end, or the limit asks for all of them
-        last = found.mesh
-        error = pictures.error(last.vertices, last.faces)
-        yield transferred(mesh, last.vertices, last.faces), error
+        most, shrink = len(coarser.faces), 2 * shrink
+        yield transferred(mesh, coarser.vertices, coarser.faces, shrink=shrink), found.error
 
 
 def _colored(fitted: RefinedSurface, config: ExportConfig, ctx: Context) -> TexturedMesh:

@@ -12,25 +12,33 @@ from svim3d.mesh.frames import tangent_frames, tangent_from_world, world_from_ta
 from svim3d.mesh.mesh import vertex_normals
 from svim3d.mesh.painted_mesh import PaintedMesh
 from svim3d.mesh.projection import SurfaceHits, project_onto
-from svim3d.mesh.texels import rasterize_uv, to_image
+from svim3d.mesh.texels import average_down, rasterize_uv, to_image
 from svim3d.numerics import normalize
 from svim3d.raster.texture import sample_texture
 
 GUTTER_PX = 4  # keeps two mip levels of charts apart
 ATLAS_TIMEOUT_S = 60.0
 SPLITS = 2  # times that faces are cut in four: nearest points are looked for among small ones
+SMALLEST = 4  # texels per side that a texture is not shrunk below
 FEW_COLOURS = 256  # a picture of no more is a palette, between whose colours nothing lies
 
 Mesh = TypeVar("Mesh", bound=PaintedMesh)
 
 
-def transferred(source: Mesh, vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> Mesh:
-    """Another mesh with the materials of `source`, its textures laid out anew in the same sizes.
+def transferred(
+    source: Mesh,
+    vertices: Float[Tensor, "N 3"],
+    faces: Int[Tensor, "F 3"],
+    *,
+    shrink: int = 1,
+) -> Mesh:
+    """Another mesh with the materials of `source`, its textures laid out anew.
 
     Args:
         source: whose maps are read, each point's at the nearest point that faces the same way.
         vertices: of the other mesh.
         faces: counter-clockwise seen from outside.
+        shrink: a power of two; the textures' sides are divided by it, down to `SMALLEST`.
     """
     normals = vertex_normals(vertices, faces)
     plain = replace(source, vertices=vertices, faces=faces, normals=normals, uv=None, tangents=None)
@@ -41,9 +49,16 @@ def transferred(source: Mesh, vertices: Float[Tensor, "N 3"], faces: Int[Tensor,
         return replace(plain, **painted)
     if not source.textures:
         return plain
-    largest = max(len(image) for image in source.textures.values())
+    sizes = {
+        name: max(len(image) // shrink, min(len(image), SMALLEST))
+        for name, image in source.textures.items()
+    }
     atlas = unwrap(
-        vertices, faces, texture_size=largest, gutter_px=GUTTER_PX, timeout_s=ATLAS_TIMEOUT_S
+        vertices,
+        faces,
+        texture_size=max(sizes.values()),
+        gutter_px=GUTTER_PX,
+        timeout_s=ATLAS_TIMEOUT_S,
     )
     split = atlas.vertex_source.long()
     frames = tangent_frames(vertices[split], atlas.faces, normals[split], atlas.uv)
@@ -57,7 +72,8 @@ def transferred(source: Mesh, vertices: Float[Tensor, "N 3"], faces: Int[Tensor,
         tangents=frames.tangents,
     )
     images = {
-        name: _repainted(name, image, old, laid_out) for name, image in source.textures.items()
+        name: _repainted(name, image, old, laid_out, sizes[name])
+        for name, image in source.textures.items()
     }
     return replace(
         laid_out,
@@ -68,23 +84,25 @@ def transferred(source: Mesh, vertices: Float[Tensor, "N 3"], faces: Int[Tensor,
 
 
 def _repainted(
-    name: str, image: Float[Tensor, "T T 3"], old: "_Source", new: PaintedMesh
-) -> Float[Tensor, "T T 3"]:
-    """One texture over the new layout."""
+    name: str, image: Float[Tensor, "T T 3"], old: "_Source", new: PaintedMesh, size: int
+) -> Float[Tensor, "size size 3"]:
+    """One texture over the new layout; of a smaller one the mean of what its texels cover."""
     assert new.uv is not None
     assert old.mesh.uv is not None
-    texels = rasterize_uv(new.uv, new.faces, len(image))
+    is_palette = name != "normal" and len(torch.unique(image.reshape(-1, 3), dim=0)) <= FEW_COLOURS
+    texels = rasterize_uv(new.uv, new.faces, size if is_palette else len(image))
     points, normals = (texels.interpolate(new.faces, a) for a in (new.vertices, new.normals))
     hits = old.nearest(points, normals)
     uv = old.at(hits, old.mesh.uv)
-    if name == "normal":
-        world = world_from_tangent(sample_texture(image, uv), *old.frame(hits))
-        return normalize(to_image(tangent_from_world(world, *new.frame(texels)), texels))
-    if len(torch.unique(image.reshape(-1, 3), dim=0)) <= FEW_COLOURS:
-        size = len(image)
-        column, row = (uv * size).long().clamp(0, size - 1).unbind(1)
+    if is_palette:
+        column, row = (uv * len(image)).long().clamp(0, len(image) - 1).unbind(1)
         return to_image(image[row, column], texels)
-    return to_image(sample_texture(image, uv), texels)
+    values = sample_texture(image, uv)
+    if name == "normal":
+        world = world_from_tangent(values, *old.frame(hits))
+        values = tangent_from_world(world, *new.frame(texels))
+    values, texels = average_down(values, texels, len(image) // size)
+    return to_image(normalize(values) if name == "normal" else values, texels)
 
 
 class _Source:

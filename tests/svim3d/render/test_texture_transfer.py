@@ -93,12 +93,36 @@ def test_textures_follow_to_a_coarser_mesh(painted):
     assert torch.rad2deg(cosine.acos()).mean() < 3.0
 
 
+def test_a_shrunken_texture_is_the_mean_of_what_its_texels_cover(painted):
+    vertices, faces = sphere(300)
+    fine = rasterize_uv(painted.uv, painted.faces, SIZE)
+    noise = 0.3 * torch.randn(len(fine.pixel), 3, generator=torch.Generator().manual_seed(0))
+    noisy = dataclasses.replace(
+        painted, basecolor=painted.basecolor + to_image(noise, fine), orm=torch.rand(8, 8, 3)
+    )
+    small = transferred(noisy, vertices, faces, shrink=4)
+    sizes = {name: len(image) for name, image in small.textures.items()}
+    assert sizes == {"basecolor": SIZE // 4, "orm": 4, "normal": SIZE // 4}
+    length = small.normal_tangent.norm(dim=2)
+    assert torch.allclose(length, torch.ones(()), atol=1e-5)
+
+    def error(mesh):
+        seen = sample_texture(mesh.basecolor, centres(mesh, mesh.uv))
+        return (seen - colour_at(0.4 * normalize(centres(mesh, mesh.vertices)))).square().mean()
+
+    # Noise of single texels is averaged away; picking one in sixteen would keep it.
+    assert error(small) < 0.3 * error(transferred(noisy, vertices, faces))
+
+
 def test_a_palette_stays_one_and_seams_go_where_no_map_needs_them(painted):
     two = torch.where(painted.basecolor[..., :1] > 0.5, 0.8, 0.2).expand(-1, -1, 3)
     flat = dataclasses.replace(painted, basecolor=two, normal_tangent=None)
     coarse = transferred(flat.without_needless_seams(), *sphere(300))
     assert coarse.tangents is None
     assert set(coarse.basecolor.unique().tolist()) == set(two.unique().tolist())
+    small = transferred(flat.without_needless_seams(), *sphere(300), shrink=2)
+    assert len(small.basecolor) == SIZE // 2
+    assert set(small.basecolor.unique().tolist()) == set(two.unique().tolist())
     even = dataclasses.replace(flat, basecolor=torch.tensor([0.1, 0.2, 0.3]))
     bare = even.without_needless_seams()
     assert bare.uv is None
