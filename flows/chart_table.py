@@ -199,6 +199,11 @@ def shown_change(axis: Axis, row: Mapping[str, Any], *, with_interval: bool = Tr
     return f"{text} [{ends}]" if with_interval else text
 
 
+def stands(state: str, by: str) -> str:
+    """Where a point stands, in words, and by which other point."""
+    return f"{state} by {by}" if state == State.DOMINATED else f"{state}{f' of {by}' if by else ''}"
+
+
 def markdown(summary: Summary, rows: Sequence[Mapping[str, Any]], told: Iterable[str]) -> str:
     """The page of tables."""
     levels = ["point", *(axis.title for axis in AXES), "stands"]
@@ -210,7 +215,7 @@ def markdown(summary: Summary, rows: Sequence[Mapping[str, Any]], told: Iterable
             [
                 str(row["point"]),
                 *(shown_level(axis, row[axis.name]) for axis in AXES),
-                _stands(row["overall"], row["overall_by"]),
+                stands(row["overall"], row["overall_by"]),
             ]
             for row in rows
         ],
@@ -241,10 +246,6 @@ def markdown(summary: Summary, rows: Sequence[Mapping[str, Any]], told: Iterable
 
 def _shown_noise(axis: Axis, noise: float) -> str:
     return f"{math.expm1(noise):.1%}" if axis.is_ratio else f"{noise:.{axis.digits}f}"
-
-
-def _stands(state: str, by: str) -> str:
-    return f"{state} by {by}" if state == State.DOMINATED else f"{state}{f' of {by}' if by else ''}"
 
 
 def _table(head: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:

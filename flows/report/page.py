@@ -25,7 +25,7 @@ from flows.report.tables import (
     stage_rows,
     versions,
 )
-from flows.report.template import TEMPLATES, filled
+from flows.report.template import TEMPLATES, address, filled
 from flows.run_records import DIED, DONE, FAILED
 
 VENDOR = Path(__file__).parent / "vendor" / "model-viewer" / "model-viewer.min.js"
@@ -79,7 +79,7 @@ def run_page(evidence: RunEvidence, pictures: Pictures) -> str:
         "keys": "\n".join(f"{s.name:12} {s.key}" for s in evidence.stages if s.key),
         "model": _safe(base64.b64encode(model).decode()) if model else "",
         "model_note": model_note,
-        "poster": _data(pictures.files.get(POSTER), "image/webp"),
+        "poster": address(pictures.files.get(POSTER), "image/webp"),
         "camera": _camera(pictures),
         "lights": _lights(pictures),
         "about": _about(pictures),
@@ -95,11 +95,6 @@ def run_page(evidence: RunEvidence, pictures: Pictures) -> str:
 def _safe(text: str) -> str:
     """Code and data that a script element holds as they are."""
     return text.replace("</script", "<\\/script")
-
-
-def _data(content: bytes | None, mime: str) -> str:
-    """A file as an address that holds it; empty for none."""
-    return f"data:{mime};base64,{base64.b64encode(content).decode()}" if content else ""
 
 
 def _viewer_code() -> str:
@@ -177,7 +172,7 @@ def _lights(pictures: Pictures) -> list[dict[str, Any]]:
             "name": name,
             "label": LIGHT_LABELS.get(name, name),
             "data": _safe(base64.b64encode(pictures.files[f"lights/{name}.hdr"]).decode()),
-            "picture": _data(pictures.files.get(f"lights/{name}.webp"), "image/webp"),
+            "picture": address(pictures.files.get(f"lights/{name}.webp"), "image/webp"),
         }
         for name in pictures.about.get("light", ())
     ]
@@ -217,11 +212,11 @@ def _left_out(evidence: RunEvidence) -> list[tuple[str, str]]:
 def _inputs(evidence: RunEvidence, pictures: Pictures) -> list[dict[str, str]]:
     """The photo and what was cut out of it."""
     source = Path(evidence.record.source)
-    given = _data(pictures.files.get("input.webp"), "image/webp")
+    given = address(pictures.files.get("input.webp"), "image/webp")
     mime = MIME.get(source.suffix.lower())
     if not given and mime and source.is_file() and source.stat().st_size <= MOST_INPUT_BYTES:
-        given = _data(source.read_bytes(), mime)
-    cut_out = _data(pictures.files.get("cut_out.webp"), "image/webp")
+        given = address(source.read_bytes(), mime)
+    cut_out = address(pictures.files.get("cut_out.webp"), "image/webp")
     found = (
         (given, "The photo as it was given", source.name),
         (cut_out, "The object that was cut out of the photo", "cut out and centred"),
@@ -234,8 +229,8 @@ def _channels(pictures: Pictures) -> list[dict[str, str]]:
         {
             "name": name,
             "label": LABELS.get(name, name),
-            "views": _data(pictures.files.get(f"views/{name}.webp"), "image/webp"),
-            "asset": _data(pictures.files.get(f"asset/{name}.webp"), "image/webp"),
+            "views": address(pictures.files.get(f"views/{name}.webp"), "image/webp"),
+            "asset": address(pictures.files.get(f"asset/{name}.webp"), "image/webp"),
         }
         for name in CHANNELS
         if f"views/{name}.webp" in pictures.files

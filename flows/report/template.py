@@ -1,5 +1,6 @@
 """The templates that all reports share, filled."""
 
+import base64
 import functools
 from pathlib import Path
 from typing import Any
@@ -25,3 +26,8 @@ def filled(name: str, **values: Any) -> str:
     """A page made of a template, with the style sheet of all of them."""
     style = (TEMPLATES / "style.css").read_text()
     return _environment().get_template(name).render(style=style, **values)
+
+
+def address(content: bytes | None, mime: str) -> str:
+    """A file as an address that holds it; empty for none."""
+    return f"data:{mime};base64,{base64.b64encode(content).decode()}" if content else ""

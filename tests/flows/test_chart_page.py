@@ -4,10 +4,11 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import pytest
 
-from flows.chart_page import SCRIPT, write_page
+from flows.chart_page import write_page
 from flows.chart_points import Case, points_of
 from flows.chart_table import rows_of, summarised
 
@@ -21,6 +22,7 @@ SWITCHES = (
 def page_of(folder):
     """A page of four points on two orbits; the third and fourth are worse and dearer."""
     points = points_of("preview", ("standard", "paper"), (), scales=(2.0,))
+    points[1] = replace(points[1], about="</script><b>")
     results = {
         Case(point.name, orbit, 0): {
             "outcome": "asset",
@@ -37,14 +39,16 @@ def page_of(folder):
     }
     summary = summarised(points, ["<pot>", "cup"], results)
     file = folder / "chart.html"
-    write_page(summary, rows_of(summary), ["made up for `<pot>`"], b"<svg></svg>", file)
+    write_page(summary, rows_of(summary), ["made up for `<pot>`, </style>"], b"<svg></svg>", file)
     return file
 
 
-def test_names_of_folders_cannot_write_the_page(tmp_path):
+def test_names_and_settings_cannot_write_the_page(tmp_path):
     text = page_of(tmp_path).read_text()
     assert "<pot>" not in text
-    assert "made up for <code>&lt;pot&gt;</code>" in text
+    assert "<b>" not in text
+    assert (text.count("</script>"), text.count("</style>")) == (2, 1)
+    assert "made up for <code>&lt;pot&gt;</code>, &lt;/style&gt;" in text
 
 
 @pytest.mark.browser
@@ -62,7 +66,8 @@ def test_points_answer(tmp_path):
     document.querySelectorAll('th button')[1].click();
     document.querySelectorAll('th button')[1].click();
     """
-    file.write_text(file.read_text().replace(SCRIPT, SCRIPT + drive))
+    page = file.read_text()
+    file.write_text(page.replace("</body>", f'<script type="module">{drive}</script></body>'))
     command = [browser, *SWITCHES, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom"]
     done = subprocess.run(
         [*command, file.as_uri()], capture_output=True, text=True, timeout=120, check=True
@@ -76,6 +81,7 @@ def test_points_answer(tmp_path):
     told = shown[shown.index('id="told"') :]
     assert "steps x2" in told[: told.index("</section>")]
     body = shown[shown.index("<tbody>") : shown.index("</tbody>")]
+    assert shown.count('aria-sort="descending"') == 1
     assert re.findall(r'<th scope="row">(.*?)</th>', body) == [
         *("paper", "standard", "steps x2", "preview"),
     ]
