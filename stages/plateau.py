@@ -86,7 +86,8 @@ class Plateau:
 
     def observe(self, step: int, loss: float) -> None:
         """What the loss is before a step."""
-        self._seen.append((step, loss + self._unseen))
+        if self.is_watched:
+            self._seen.append((step, loss + self._unseen))
 
     def after(self, step: int, ctx: Context) -> int:
         """The step that comes next."""
