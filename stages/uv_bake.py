@@ -86,11 +86,11 @@ def run(
     values, texels = average_down(values, texels, config.supersample)
     corrections = fitted.corrections if config.correct_views else None
     pixels_at = cache(lambda size: _seen(mesh, size, views, corrections))
+    unfitted, local, occlusion = values.split([5, 3, 1], 1)
+    fitted_values = unfitted
     if config.fit_iterations:
-        fit = _sharpened(values[:, :5], texels, pixels_at(texels.size), config)
-        values = torch.cat([fit, values[:, 5:]], 1)
-    surface_values, local, occlusion = values.split([5, 3, 1], 1)
-    baked = BakedTexels(surface_values, occlusion, local, mesh, texels)
+        fitted_values = _sharpened(unfitted, texels, pixels_at(texels.size), config)
+    baked = BakedTexels(fitted_values, unfitted, occlusion, local, mesh, texels)
     maps = material_maps(baked, pixels_at, views.normal_world, _wanted(config))
     for name, note in maps.notes.items():
         ctx.event("material", f"{name}: {note}", tell=False)

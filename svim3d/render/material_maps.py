@@ -24,6 +24,7 @@ from svim3d.render.material_evidence import (
     judge,
 )
 from svim3d.render.palettes import growing_palettes, palette_values
+from svim3d.render.texture_detail import gained_db, unseen_errors
 from svim3d.render.texture_fit import fit_texels
 from svim3d.render.texture_size import size_for_pixels, sufficient_texels
 from svim3d.render.view_pixels import FLOOR_RMS, ViewPixels
@@ -32,6 +33,9 @@ NORMAL, OCCLUSION = "normal", "occlusion"
 # RMS angle below which normals are not told apart: decimation may turn them by 1 degree on average,
 # which is 1.13 to 1.3 degrees RMS.
 NORMAL_FLOOR_RAD = math.radians(1.25)
+FINER_PAYS_DB = (
+    0.5  # in unseen views; a texture of twice the side takes three to four times the bytes
+)
 NO_OCCLUSION = FLOOR_RMS  # RMS share of hidden sky that nobody sees
 
 
@@ -41,6 +45,7 @@ class BakedTexels:
 
     Attributes:
         surface: basecolor (linear), roughness and metallic.
+        unfitted: the same before it was sharpened against the views.
         occlusion: share of the sky that is seen.
         local: shading normals in tangent space.
         mesh: whose texels they are, with tangents.
@@ -48,6 +53,7 @@ class BakedTexels:
     """
 
     surface: Float[Tensor, "P 5"]
+    unfitted: Float[Tensor, "P 5"]
     occlusion: Float[Tensor, "P 1"]
     local: Float[Tensor, "P 3"]
     mesh: PaintedMesh
@@ -162,14 +168,39 @@ class _Maker:
             name: sufficient_texels(values, baked.texels, most=self._enough)
             for name, values in stored.items()
         }
-        self._sizes = {
-            name: texels.texels.size if wanted.sized else size for name, texels in found.items()
-        }
+        self._gains = self._gains_of_finer()
+        self._sizes = {name: size for name in stored}
+        if wanted.sized:
+            self._sizes = {name: texels.texels.size for name, texels in found.items()}
+            for name, gain in self._gains.items():
+                if gain >= FINER_PAYS_DB:
+                    finer = sufficient_texels(stored[name], baked.texels, most=2 * self._enough)
+                    self._sizes[name] = finer.texels.size
         # Only what is seen counts as known: the rest is as baked in any form.
         self._counts = {
             name: max(1, round(self._seen_share * texels.texels.size**2))
             for name, texels in found.items()
         }
+
+    def _gains_of_finer(self) -> dict[str, float]:
+        """By how much maps of twice the size show unseen views better, dB, where it may matter."""
+        wanted, pixels = self._wanted, self._pixels
+        seen = round(self._seen_share * pixels.texture_size**2)
+        looks = float((pixels.weight > 0.0).sum())
+        most = size_for_pixels(looks, seen, pixels.texture_size)
+        if not (wanted.sized and wanted.sharpened) or most <= self._enough:
+            return {}
+        errors = [
+            unseen_errors(
+                self._pixels_at(size),
+                self._averaged(self._baked.unfitted, size).reshape(size * size, -1),
+                GROUPS,
+                prior=wanted.prior,
+                iterations=wanted.sharpened,
+            )
+            for size in (self._enough, 2 * self._enough)
+        ]
+        return {name: gained_db(errors[0][name], errors[1][name]) for name in errors[0]}
 
     def maps(self) -> MaterialMaps:
         """Every map in its form and size."""
@@ -193,8 +224,13 @@ class _Maker:
         textured = {BASECOLOR.name: basecolor, "orm": orm, NORMAL: normal}
         for name, image in textured.items():
             if self._wanted.sized and image is not None and image.ndim == 3:
-                limit = f"{self._enough} px are what the views hold"
+                limit = f"one look at each part holds {self._enough} px"
                 notes[f"{name} size"] = f"{len(image)} of {self._baked.texels.size} px; {limit}"
+        for name, gain in self._gains.items():
+            notes[f"{name} detail"] = (
+                f"twice as many px show unseen views {gain:+.2f} dB better; "
+                f"{FINER_PAYS_DB} dB would pay"
+            )
         return MaterialMaps(
             basecolor=basecolor,
             orm=orm,
