@@ -68,12 +68,12 @@ def test_a_thin_part_asks_for_small_cells_and_whole_pictures(plain, make_context
 
 def test_few_views_ask_for_few_steps_of_phase_2(plain, make_context):
     config = DmtetConfig(steps=600)
-    for count, steps in ((9, 270), (3, 90)):
+    for count, steps in ((9, 135), (3, 45)):
         images = {k: v[:count] for k, v in vars(plain).items() if isinstance(v, torch.Tensor)}
         few = dataclasses.replace(plain, cameras=plain.cameras[list(range(count))], **images)
         plan = planned(few, make_context)
         assert bounded(config, plan, make_context("dmtet")).steps == steps
-    assert bounded(DmtetConfig(steps=50), plan, make_context("dmtet")).steps == 50
+    assert bounded(DmtetConfig(steps=40), plan, make_context("dmtet")).steps == 40
 
 
 def test_an_untrusted_pattern_does_not_count(plain, patterned, make_context):
