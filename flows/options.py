@@ -63,7 +63,7 @@ def shared_options() -> argparse.ArgumentParser:
 
 def _names(text: str) -> list[str]:
     """Names between commas."""
-    return [name for name in text.split(",") if name]
+    return [name.strip() for name in text.split(",")]
 
 
 def add_share(parser: argparse.ArgumentParser) -> None:

@@ -34,7 +34,7 @@ BLACK_LEVEL = 0.02  # of the mean radiance: below it the square root no longer m
 CLIPPED_SHARE = 1e-3  # of all values; if so many equal the largest, they are clipped highlights
 MIN_RADIANCE = 1e-6  # keeps the logarithm of the starting light finite for black pictures
 LIGHT = "light"  # name of the parameter
-ADAM_EPS = 1e-8  # texels that nothing reflects keep the light they started with
+ADAM_EPS = 1e-8  # far below the gradients of texels that anything reflects
 ADAM_BETAS = (0.9, 0.95)  # the second moment forgets in 20 of 200 steps, as log radiance settles
 
 

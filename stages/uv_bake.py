@@ -87,10 +87,10 @@ def run(
     corrections = fitted.corrections if config.correct_views else None
     pixels_at = cache(lambda size: _seen(mesh, size, views, corrections))
     unfitted, local, occlusion = values.split([5, 3, 1], 1)
-    fitted_values = unfitted
+    sharpened = unfitted
     if config.fit_iterations:
-        fitted_values = _sharpened(unfitted, texels, pixels_at(texels.size), config)
-    baked = BakedTexels(fitted_values, unfitted, occlusion, local, mesh, texels)
+        sharpened = _sharpened(unfitted, texels, pixels_at(texels.size), config)
+    baked = BakedTexels(sharpened, unfitted, occlusion, local, mesh, texels)
     maps = material_maps(baked, pixels_at, views.normal_world, _wanted(config))
     for name, note in maps.notes.items():
         ctx.event("material", f"{name}: {note}", tell=False)

@@ -127,6 +127,7 @@ class NamedAdam:
 
     def load_state(self, tensors: Mapping[str, Tensor]) -> None:
         """Take over what `state` gave; parameters must already have their shapes."""
+        self._state.clear()
         with torch.no_grad():
             for name, parameter in self.parameters.items():
                 parameter.copy_(tensors[f"value.{name}"])

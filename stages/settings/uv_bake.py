@@ -36,7 +36,7 @@ class UvBakeConfig(StageConfig):
     )
     texture_sizes: Literal["fixed", "evidence"] = Field(
         default="fixed",
-        description="evidence: each map as small as its detail and the views' pixels allow (45 dB)",
+        description="evidence: each map as small as its detail (45 dB) and the views allow",
     )
     min_area_share: float = Field(
         default=0.002,

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from svim3d.compiled import kernel
 from svim3d.mesh.tetrahedra import (
@@ -120,7 +121,10 @@ def _cross(nodes: Array, sdf: Array, edges: IntArray, points: Array) -> None:
         a, b = edges[e, 0], edges[e, 1]
         t = sdf[a] / _guarded(sdf[a] - sdf[b])
         for axis in range(3):
-            points[e, axis] = nodes[a, axis] + t * (nodes[b, axis] - nodes[a, axis])
+            # From the nearer end, as torch.lerp does: a zero at b gives exactly b.
+            way = nodes[b, axis] - nodes[a, axis]
+            near_a = t < 0.5
+            points[e, axis] = nodes[a, axis] + t * way if near_a else nodes[b, axis] - (1 - t) * way
 
 
 @kernel()
@@ -162,6 +166,7 @@ class _Crossing(torch.autograd.Function):
         return points
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, grad_points: Tensor) -> tuple[Tensor, Tensor, None]:
         """Gradients of node positions and values."""
         nodes, sdf, edges = ctx.saved_tensors
@@ -187,7 +192,7 @@ def find_crossings(
         lattice: tetrahedra and their edges.
     """
     if inside.device.type != "cpu":
-        return find_crossings_torch(inside, lattice)
+        return find_crossings_reference(inside, lattice)
     crossed, faces = _march(
         inside.numpy(),
         lattice.edges.numpy(),
@@ -197,7 +202,7 @@ def find_crossings(
     return lattice.edges[torch.from_numpy(crossed)], torch.from_numpy(faces)
 
 
-def find_crossings_torch(
+def find_crossings_reference(
     inside: Bool[Tensor, "N"], lattice: TetrahedralLattice
 ) -> tuple[Int[Tensor, "V 2"], Int[Tensor, "F 3"]]:
     """`find_crossings` in plain torch, for any device; the same result."""

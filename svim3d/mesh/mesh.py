@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from svim3d.compiled import kernel
 from svim3d.numerics import MIN_NORM_SQUARED, dot, length, normalize
@@ -102,14 +103,16 @@ class _VertexNormals(torch.autograd.Function):
         return normalize(summed)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, grad_normals: Tensor) -> tuple[Tensor, None]:
         """Gradient of the vertices."""
         vertices, faces, summed = ctx.saved_tensors
         size = length(summed)
         normals = summed / size
         # Where the sum vanishes its guarded length is constant, and the quotient linear.
-        along = torch.where(size.square() > MIN_NORM_SQUARED, dot(normals, grad_normals), 0.0)
-        grad_summed = (grad_normals - normals * along) / size
+        is_free = dot(summed, summed) > MIN_NORM_SQUARED
+        along = torch.where(is_free, dot(normals, grad_normals), 0.0)
+        grad_summed = ((grad_normals - normals * along) / size).contiguous()
         grad_vertices = torch.zeros_like(vertices)
         _sum_normals_backward(
             vertices.numpy(), faces.numpy(), grad_summed.numpy(), grad_vertices.numpy()

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from svim3d.compiled import kernel
@@ -96,6 +97,7 @@ class _Laplacian(torch.autograd.Function):
         return offset.square().sum(1).mean()
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
         """Gradient of the vertices."""
         faces, degree, offset = ctx.saved_tensors

@@ -11,9 +11,11 @@ from collections.abc import Iterable
 from jaxtyping import Float
 from torch import Tensor
 
-from svim3d.render.material_evidence import Channels
+from svim3d.render.material_evidence import KNOWN, Channels
 from svim3d.render.texture_fit import fit_texels
 from svim3d.render.view_pixels import ViewPixels
+
+EXACT = 1e-12  # a mean square error below this is none
 
 
 def unseen_errors(
@@ -26,9 +28,12 @@ def unseen_errors(
 ) -> dict[str, float]:
     """Mean square errors, by group, in every other view of a texture fitted to the views between.
 
+    Only pixels count whose texels the fitted views have seen; without any there is no figure.
+
     Args:
         pixels: what the views show, over the texture.
-        start: its texels before any fit: they must not know the views that are asked.
+        start: its texels as the field has them, before any fit of texels. The field has learnt from
+            all views, which makes no difference between sizes of textures.
         groups: which channels are judged together.
         prior: see `fit_texels`.
         iterations: of the fit.
@@ -39,7 +44,11 @@ def unseen_errors(
         known.operator, known.target, known.weight, start, prior=prior, iterations=iterations
     )
     shown, weight = asked.operator(fitted), asked.weight.double()
-    total = weight.sum().clamp_min(1e-12)
+    is_seen = (known.operator.adjoint(known.weight) > 0.0).to(fitted)
+    weight = weight * (asked.operator(is_seen) >= KNOWN)
+    total = float(weight.sum())
+    if total == 0.0:
+        return {}
     errors = {}
     for group in groups:
         squared = (
@@ -51,4 +60,4 @@ def unseen_errors(
 
 def gained_db(before: float, after: float) -> float:
     """By how much a mean square error has fallen; 0 where there was none."""
-    return 10.0 * math.log10(before / max(after, 1e-12)) if before > 0.0 else 0.0
+    return 10.0 * math.log10(before / max(after, EXACT)) if before > 0.0 else 0.0

@@ -1,7 +1,8 @@
 """How large a texture must be: halved for as long as nobody would see it.
 
 A texture may be halved when the halves, read back bilinearly where the larger one had its texels,
-are it to 45 dB. And it need not have more texels than there are pixels that saw the surface.
+are it to 45 dB. And it need not have more texels than there are pixels that saw the surface, each
+part in the view that shows it largest, unless `texture_detail` finds that more are worth it.
 
 Differs from what is also in use, to stop where less than 1 % of the energy lies above the smaller
 size's Nyquist frequency: of a pattern with a standard deviation of 0.3 that is an error of 30 dB.

@@ -15,11 +15,11 @@ from svim3d.mesh.projection import SurfaceHits, project_onto
 from svim3d.mesh.texels import average_down, rasterize_uv, to_image
 from svim3d.numerics import normalize
 from svim3d.raster.texture import sample_texture
+from svim3d.render.texture_size import SMALLEST
 
 GUTTER_PX = 4  # keeps two mip levels of charts apart
 ATLAS_TIMEOUT_S = 60.0
 SPLITS = 2  # times that faces are cut in four: nearest points are looked for among small ones
-SMALLEST = 4  # texels per side that a texture is not shrunk below
 FEW_COLOURS = 256  # a picture of no more is a palette, between whose colours nothing lies
 
 Mesh = TypeVar("Mesh", bound=PaintedMesh)
@@ -38,7 +38,7 @@ def transferred(
         source: whose maps are read, each point's at the nearest point that faces the same way.
         vertices: of the other mesh.
         faces: counter-clockwise seen from outside.
-        shrink: a power of two; the textures' sides are divided by it, down to `SMALLEST`.
+        shrink: a power of two that the textures' sides are divided by, while texels stay whole.
     """
     normals = vertex_normals(vertices, faces)
     plain = replace(source, vertices=vertices, faces=faces, normals=normals, uv=None, tangents=None)
@@ -49,15 +49,12 @@ def transferred(
         return replace(plain, **painted)
     if not source.textures:
         return plain
-    sizes = {
-        name: max(len(image) // shrink, min(len(image), SMALLEST))
-        for name, image in source.textures.items()
-    }
+    sizes = {name: _shrunken(len(image), shrink) for name, image in source.textures.items()}
     atlas = unwrap(
         vertices,
         faces,
         texture_size=max(sizes.values()),
-        gutter_px=GUTTER_PX,
+        gutter_px=max(1, GUTTER_PX // shrink),
         timeout_s=ATLAS_TIMEOUT_S,
     )
     split = atlas.vertex_source.long()
@@ -81,6 +78,13 @@ def transferred(
         orm=images.get("orm", source.orm),
         normal_tangent=images.get("normal"),
     ).without_needless_seams()
+
+
+def _shrunken(size: int, shrink: int) -> int:
+    """A side halved as often as `shrink` has it, while that gives whole texels and enough."""
+    while shrink > 1 and size % 2 == 0 and size // 2 >= SMALLEST:
+        size, shrink = size // 2, shrink // 2
+    return size
 
 
 def _repainted(

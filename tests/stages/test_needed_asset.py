@@ -38,6 +38,7 @@ from svim3d.mesh.lathe import revolve
 from svim3d.mesh.mesh import vertex_normals
 from svim3d.metrics import psnr
 from svim3d.numerics import normalize
+from svim3d.render import material_maps
 from svim3d.render.deferred import environment_shader
 from svim3d.render.face_budget import COARSER, ShapePictures
 from svim3d.render.pictures import render_pictures
@@ -279,6 +280,37 @@ def test_levels_of_detail_are_held_against_the_asset_not_each_other(one):
         error = whole.error(mesh.vertices, mesh.faces)
         assert error.normal_deg < 1.1 * most.normal_deg
         assert error.silhouette < 1.1 * most.silhouette
+
+
+def test_textures_of_levels_are_halved(pattern_as_textures):
+    mesh = pattern_as_textures.mesh
+    levels = [level for level, _ in export._coarser(mesh, 2)]
+    for count, level in enumerate(levels, 1):
+        sizes = {name: len(image) for name, image in level.textures.items()}
+        assert sizes == {name: len(i) // 2**count for name, i in mesh.textures.items()}
+    assert len(levels) == 2
+
+
+@pytest.mark.parametrize("gain_db", [0.1, 0.9])
+def test_a_finer_texture_is_kept_where_unseen_views_gain(pattern, gain_db, monkeypatch):
+    asked = []
+
+    def errors(pixels, start, groups, **_):
+        asked.append(pixels.texture_size)
+        factor = 1.0 if len(asked) == 1 else 10.0 ** (-gain_db / 10.0)
+        return {group.name: 1e-3 * factor for group in groups}
+
+    monkeypatch.setattr(material_maps, "unseen_errors", errors)
+    config = NEEDED.model_copy(update={"texture_size": 256})
+    context = pattern._context(pattern.file.parent, f"gain {gain_db}")
+    mesh = uv_bake.run(pattern.views, pattern.field, None, config=config, ctx=context)
+    assert asked == [128, 256]
+    assert len(mesh.basecolor) == (256 if gain_db > material_maps.FINER_PAYS_DB else 128)
+    told = [event["message"] for event in context.events if " detail: " in event["message"]]
+    assert len(told) == 3 and all(f"{gain_db:+.2f} dB better" in message for message in told)
+    unfitted = config.model_copy(update={"fit_iterations": 0})
+    uv_bake.run(pattern.views, pattern.field, None, config=unfitted, ctx=context)
+    assert asked == [128, 256]
 
 
 def _knurled_sphere():

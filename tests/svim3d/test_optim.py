@@ -1,5 +1,8 @@
 """Named Adam: equal to torch's, replaceable parameters, complete state."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 from torch import nn
@@ -53,6 +56,38 @@ def test_replaced_parameter_carries_its_moments_and_removed_one_is_gone():
     quadratic_step(adam)
     assert set(adam.parameters) == {"a"}
     assert float(b.detach()) == kept
+
+
+def test_a_parameter_that_never_had_a_gradient_stays_and_begins_late():
+    def make():
+        idle, used = nn.Parameter(torch.ones(2)), nn.Parameter(torch.zeros(2))
+        return NamedAdam({"idle": idle, "used": used}, {"idle": Rate(0.1), "used": Rate(0.1)})
+
+    def step_used(adam):
+        adam.zero_grad()
+        (adam.parameters["used"] - 1.0).square().sum().backward()
+        adam.step(1.0)
+
+    first, second = make(), make()
+    step_used(first)
+    assert torch.equal(first.parameters["idle"], torch.ones(2))
+    quadratic_step(second)  # a past that the loaded state has to wipe out
+    second.load_state({name: t.clone() for name, t in first.state().items()})
+    for adam in (first, second):
+        (3.0 * adam.parameters["idle"]).sum().backward()
+        adam.step(1.0)
+    for name in ("idle", "used"):
+        assert torch.equal(first.parameters[name], second.parameters[name])
+
+
+def test_a_step_imports_no_compiler():
+    code = (
+        "import sys, torch; from svim3d.optim import NamedAdam, Rate\n"
+        "p = torch.nn.Parameter(torch.zeros(1)); p.grad = torch.ones(1)\n"
+        "NamedAdam({'p': p}, {'p': Rate(0.1)}).step(1.0)\n"
+        "assert abs(float(p.detach()) + 0.1) < 1e-6 and 'torch._dynamo' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_one_bad_entry_shows_in_its_parameters_gradient():

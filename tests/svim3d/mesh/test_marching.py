@@ -11,7 +11,7 @@ from svim3d.mesh.marching import (
     crossing_points_reference,
     extract_surface,
     find_crossings,
-    find_crossings_torch,
+    find_crossings_reference,
 )
 from svim3d.mesh.mesh import face_adjacency, face_normals_scaled, signed_volume
 from svim3d.mesh.tetrahedra import (
@@ -150,7 +150,7 @@ def test_the_torch_twin_gives_the_same_crossings():
     lattice = lattice_around_surface(corners, cell_centres(corners), HALF, reach=0.1)
     inside = torch.rand(len(lattice.nodes), generator=torch.Generator().manual_seed(0)) > 0.5
     for fast, plain in zip(
-        find_crossings(inside, lattice), find_crossings_torch(inside, lattice), strict=True
+        find_crossings(inside, lattice), find_crossings_reference(inside, lattice), strict=True
     ):
         assert torch.equal(fast, plain)
 
@@ -184,6 +184,14 @@ def test_the_torch_twin_gives_the_same_points_and_gradients():
     assert float((values[edges.long()].diff(dim=1)).abs().min()) < MIN_DIFFERENCE
     for fast, plain in zip(*found, strict=True):
         torch.testing.assert_close(fast, plain, rtol=1e-3, atol=1e-4)
+
+
+def test_a_zero_at_the_end_of_an_edge_is_that_end_to_the_bit():
+    nodes = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0))
+    edges = torch.arange(2000).view(-1, 2)
+    sdf = torch.where(torch.arange(2000) % 2 == 0, -torch.rand(2000) - 0.1, 0.0)
+    for found in (crossing_points, crossing_points_reference):
+        assert torch.equal(found(nodes, sdf, edges), nodes[1::2])
 
 
 def test_growing_the_sdf_moves_the_surface_outward_by_as_much():

@@ -77,6 +77,13 @@ def test_groups_are_judged_apart():
     assert max(found["basecolor"], found["metallic"]) < 0.3
 
 
+def test_views_that_cannot_check_each_other_give_no_figure():
+    pixels = looks(torch.full((FINE, FINE, 5), 0.5), noise=0.0)
+    alone = pixels.take(pixels.view == 0)
+    start = torch.zeros(FINE**2, 5)
+    assert unseen_errors(alone, start, GROUPS, prior=PRIOR, iterations=2) == {}
+
+
 def test_gain_is_in_decibels():
     assert gained_db(1e-3, 1e-4) == pytest.approx(10.0)
     assert gained_db(0.0, 0.0) == 0.0

@@ -114,6 +114,13 @@ def test_a_shrunken_texture_is_the_mean_of_what_its_texels_cover(painted):
     assert error(small) < 0.3 * error(transferred(noisy, vertices, faces))
 
 
+@pytest.mark.parametrize(("shrink", "size"), [(2, 50), (4, 25), (8, 25)])
+def test_odd_sides_are_not_halved(painted, shrink, size):
+    image = torch.nn.functional.interpolate(painted.basecolor.movedim(-1, 0)[None], 100)[0]
+    odd = dataclasses.replace(painted, basecolor=image.movedim(0, -1), normal_tangent=None)
+    assert len(transferred(odd, *sphere(300), shrink=shrink).basecolor) == size
+
+
 def test_a_palette_stays_one_and_seams_go_where_no_map_needs_them(painted):
     two = torch.where(painted.basecolor[..., :1] > 0.5, 0.8, 0.2).expand(-1, -1, 3)
     flat = dataclasses.replace(painted, basecolor=two, normal_tangent=None)
