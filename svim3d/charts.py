@@ -171,9 +171,7 @@ def _name_marks(axis: Any, marks: Sequence[Mark]) -> None:
         for right, up in PLACES:
             left = x + (right if right > 0 else right - width)
             box = (left, y + up, left + width, y + up + LINE_PX)
-            inside = (
-                frame.x0 <= box[0] and box[2] <= frame.x1 + 4 * LETTER_PX and box[1] >= frame.y0
-            )
+            inside = frame.x0 <= box[0] and box[2] <= frame.x1 and box[1] >= frame.y0
             if inside and not any(_overlap(box, other) for other in taken):
                 taken.append(box)
                 # In points: SVG counts other pixels than PNG.
