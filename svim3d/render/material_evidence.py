@@ -32,7 +32,6 @@ Form = Literal["constant", "palette", "texture"]
 Curve = Callable[[Tensor], Tensor]
 
 LARGEST_PALETTE = 4  # clusters; more seldom pay, and a file of so many is a texture's size
-KNOWN = 0.99  # share of a pixel whose texels the other half of the views has seen
 MIN_PIXELS = 64  # held-out pixels below which nothing can be said
 
 
@@ -232,7 +231,7 @@ class _HeldOut:
 def _held_out(train: ViewPixels, test: ViewPixels, prior: float, iterations: int) -> _HeldOut:
     """Fit every form to one set of pixels and measure it on the other."""
     mass = train.mass()
-    known = test.operator((mass > 0).float()[:, None])[:, 0] > KNOWN
+    known = test.known_to(train)
     mean = train.mean()
     # From the mean, not from what was baked: the field has seen all views, these ones too.
     start = mean.expand(len(mass), -1).contiguous()

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from jaxtyping import Float
 from torch import Tensor
 
-from svim3d.render.material_evidence import KNOWN, Channels
+from svim3d.render.material_evidence import Channels
 from svim3d.render.texture_fit import fit_texels
 from svim3d.render.view_pixels import ViewPixels
 
@@ -43,9 +43,8 @@ def unseen_errors(
     fitted = fit_texels(
         known.operator, known.target, known.weight, start, prior=prior, iterations=iterations
     )
-    shown, weight = asked.operator(fitted), asked.weight.double()
-    is_seen = (known.operator.adjoint(known.weight) > 0.0).to(fitted)
-    weight = weight * (asked.operator(is_seen) >= KNOWN)
+    shown = asked.operator(fitted)
+    weight = asked.weight.double() * asked.known_to(known)[:, None]
     total = float(weight.sum())
     if total == 0.0:
         return {}

@@ -81,7 +81,16 @@ def size_for_pixels(pixels: float, seen: int, size: int) -> int:
     if seen == 0:
         return size
     wanted = size * math.sqrt(pixels / seen)
-    smaller = size
-    while smaller % 2 == 0 and smaller // 2 >= max(wanted, SMALLEST):
-        smaller //= 2
-    return smaller
+    return halved(size, wanted)
+
+
+def halved(size: int, least: float) -> int:
+    """A side halved for as long as texels stay whole and no fewer than `least` and `SMALLEST`.
+
+    Args:
+        size: texels per side.
+        least: texels per side that are wanted.
+    """
+    while size % 2 == 0 and size // 2 >= max(least, SMALLEST):
+        size //= 2
+    return size

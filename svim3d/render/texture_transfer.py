@@ -15,7 +15,7 @@ from svim3d.mesh.projection import SurfaceHits, project_onto
 from svim3d.mesh.texels import average_down, rasterize_uv, to_image
 from svim3d.numerics import normalize
 from svim3d.raster.texture import sample_texture
-from svim3d.render.texture_size import SMALLEST
+from svim3d.render.texture_size import halved
 
 GUTTER_PX = 4  # keeps two mip levels of charts apart
 ATLAS_TIMEOUT_S = 60.0
@@ -49,7 +49,9 @@ def transferred(
         return replace(plain, **painted)
     if not source.textures:
         return plain
-    sizes = {name: _shrunken(len(image), shrink) for name, image in source.textures.items()}
+    sizes = {
+        name: halved(len(image), len(image) / shrink) for name, image in source.textures.items()
+    }
     atlas = unwrap(
         vertices,
         faces,
@@ -78,13 +80,6 @@ def transferred(
         orm=images.get("orm", source.orm),
         normal_tangent=images.get("normal"),
     ).without_needless_seams()
-
-
-def _shrunken(size: int, shrink: int) -> int:
-    """A side halved as often as `shrink` has it, while that gives whole texels and enough."""
-    while shrink > 1 and size % 2 == 0 and size // 2 >= SMALLEST:
-        size, shrink = size // 2, shrink // 2
-    return size
 
 
 def _repainted(

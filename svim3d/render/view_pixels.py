@@ -16,6 +16,7 @@ from svim3d.shading.linear_operator import SparseOperator
 
 FLOOR_DB = 45.0  # of a peak of 1: what is closer than 1.4 steps of 8 bits is not told apart
 FLOOR_RMS = 10.0 ** (-FLOOR_DB / 20.0)
+KNOWN = 0.99  # share of a pixel whose texels other views have seen
 OUTLIER = 3.0 * 1.4826  # times the median magnitude: three standard deviations of Gaussian noise
 # Of the picture's side. What errs alike over more is no noise but another material.
 MAX_LAG = 1 / 8
@@ -85,6 +86,11 @@ class ViewPixels:
     def mass(self) -> Float[Tensor, "T"]:
         """Summed weight of the pixels that see each texel."""
         return self.operator.adjoint(self.weight)[:, 0]
+
+    def known_to(self, others: "ViewPixels") -> Bool[Tensor, "P"]:
+        """Pixels that show only texels which the others have seen, too."""
+        seen = (others.mass() > 0).float()
+        return self.operator(seen[:, None])[:, 0] > KNOWN
 
     def distinct(self) -> tuple[float, int]:
         """Pixels of the surface's parts, each part in the view that shows it largest; and texels.
